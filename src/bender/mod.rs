@@ -1,0 +1,1 @@
+//! The machine: profiles, links, and the stage-verify-commit handshake, the only gate to it.

@@ -1,0 +1,52 @@
+//! The command line: one file per subcommand, no logic of its own.
+//!
+//! Exit status: 0 done, 1 the tube or the machine said no, 2 the input or the arguments are unusable. Errors go
+//! to stderr, results to stdout; `--json` prints exactly one JSON object.
+
+mod reconstruct;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Closes the loop on CNC tube bending.
+#[derive(Debug, Parser)]
+#[command(name = "benderd", version, about, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Reconstructs the tube in one scan: LRA with uncertainties.
+    Reconstruct(reconstruct::Args),
+}
+
+/// How a subcommand ended; errors (unusable input, exit 2) travel as `anyhow::Error`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Exit 0.
+    Done,
+    /// Exit 1: the tube or the machine said no.
+    No,
+    /// Exit 3: a delivery's outcome stayed unknown.
+    Unknown,
+}
+
+/// Runs the program's arguments.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let result: anyhow::Result<Outcome> = match cli.command {
+        Command::Reconstruct(args) => reconstruct::run(&args),
+    };
+    match result {
+        Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::No) => ExitCode::from(1),
+        Ok(Outcome::Unknown) => ExitCode::from(3),
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(2)
+        }
+    }
+}

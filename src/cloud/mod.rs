@@ -1,0 +1,1 @@
+//! Point clouds: reading scan files through one strict door, thinning, ordering, neighbours.

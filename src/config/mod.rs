@@ -1,0 +1,12 @@
+//! TOML files to validated types: every error names file, line, key, what was found and what is allowed.
+//!
+//! A side door of the house: files come in here, checked values go to the rooms. [`Document`] is the one way
+//! in for every TOML file of the project (machine profiles too).
+
+mod document;
+mod materials;
+mod part;
+
+pub use document::{ConfigError, Document};
+pub use materials::Materials;
+pub use part::{load_part, parse_part};

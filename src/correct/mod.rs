@@ -1,0 +1,1 @@
+//! Deviations to the next bending table: spring-back, limits, verdicts.

@@ -1,0 +1,1 @@
+//! Measured tube against nominal: alignment, deviations, verdict.

@@ -1,0 +1,1 @@
+//! The record: what was measured, decided, sent and acknowledged, chained by hash.

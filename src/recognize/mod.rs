@@ -1,0 +1,1 @@
+//! Local geometry in a cloud: jets (normals, shape operator); later planes and surfaces of revolution.

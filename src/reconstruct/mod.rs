@@ -1,0 +1,1 @@
+//! Cloud to measured tube: spine, arc-line spline, least-squares fit, uncertainty.

@@ -1,0 +1,1 @@
+//! Simulated tube, scan arm and bender: stand-ins for the hardware that share nothing with the estimators.

@@ -1,0 +1,1 @@
+//! The whole chain run against the simulators: demo and campaigns.

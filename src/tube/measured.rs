@@ -1,0 +1,132 @@
+//! A tube as measured: every value with one standard deviation, unknown where the data does not carry it.
+//!
+//! Its serialised form is the contract of `benderd reconstruct --json`, which `inspect` and `correct` read
+//! back (also from other programs: fields that only this program adds may be absent there).
+
+use serde::{Deserialize, Serialize};
+
+use super::{Bend, Lra, deg};
+
+/// One measured row. Radians inside, degrees in JSON. `None` is "not known", never a guess.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct MeasuredBend {
+    /// Straight before the bend.
+    pub length_mm: Option<f64>,
+    /// Its sigma.
+    #[serde(default)]
+    pub length_sigma_mm: Option<f64>,
+    /// Turn against the bend before; 0 in the first row.
+    #[serde(rename = "rotation_deg", with = "deg::option")]
+    pub rotation_rad: Option<f64>,
+    /// Its sigma.
+    #[serde(rename = "rotation_sigma_deg", with = "deg::option", default)]
+    pub rotation_sigma_rad: Option<f64>,
+    /// Bend angle, always known.
+    #[serde(rename = "angle_deg", with = "deg")]
+    pub angle_rad: f64,
+    /// Its sigma.
+    #[serde(rename = "angle_sigma_deg", with = "deg")]
+    pub angle_sigma_rad: f64,
+    /// CLR as formed.
+    #[serde(default)]
+    pub radius_mm: Option<f64>,
+    /// Its sigma.
+    #[serde(default)]
+    pub radius_sigma_mm: Option<f64>,
+}
+
+/// What one scan says of one tube.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MeasuredTube {
+    /// Outer radius of the tube.
+    pub tube_radius_mm: f64,
+    /// Points in the scan after the door.
+    #[serde(default)]
+    pub points_total: usize,
+    /// Points that the last fit used (the others are outliers).
+    #[serde(default)]
+    pub points_used: usize,
+    /// Median distance of the used points from the fitted surface.
+    #[serde(default)]
+    pub residual_median_mm: f64,
+    /// Wall-clock time from open file to result; the only field that differs between equal runs.
+    #[serde(default)]
+    pub elapsed_ms: f64,
+    /// SHA-256 of the scan file, hex.
+    #[serde(default)]
+    pub scan_sha256: String,
+    /// Straight after the last bend.
+    pub last_length_mm: Option<f64>,
+    /// Its sigma.
+    #[serde(default)]
+    pub last_length_sigma_mm: Option<f64>,
+    /// Rows in order of travel.
+    pub bends: Vec<MeasuredBend>,
+    /// End - corner, corner - corner, ..., corner - end; unknown beside bends of 150 degrees or more.
+    #[serde(default)]
+    pub intersection_mm: Vec<Option<f64>>,
+    /// Their sigmas.
+    #[serde(default)]
+    pub intersection_sigma_mm: Vec<Option<f64>>,
+    /// With a nominal: whether the scan was turned round to its direction.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reversed: Option<bool>,
+    /// What a reader should know before trusting the numbers.
+    #[serde(default)]
+    pub warnings: Vec<String>,
+}
+
+impl MeasuredTube {
+    /// From this bend angle on a corner runs away and intersection distances are not given.
+    pub const INTERSECTION_LIMIT_RAD: f64 = 150.0 * std::f64::consts::PI / 180.0;
+
+    /// The measured values as a plain table; unknown lengths, rotations and radii are filled from `fallback`
+    /// (row by row, when it has as many bends) or with 0. For laying the tube out, not for correcting by.
+    pub fn lra_or(&self, fallback: Option<&Lra>) -> Lra {
+        let same = fallback.filter(|f| f.bends.len() == self.bends.len());
+        let bends = self.bends.iter().enumerate().map(|(i, b)| {
+            let f = same.map(|f| f.bends[i]);
+            Bend {
+                length_mm: b.length_mm.or(f.map(|f| f.length_mm)).unwrap_or(0.0),
+                rotation_rad: b.rotation_rad.or(f.map(|f| f.rotation_rad)).unwrap_or(0.0),
+                angle_rad: b.angle_rad,
+                radius_mm: b.radius_mm.or(f.map(|f| f.radius_mm)).unwrap_or(0.0),
+            }
+        });
+        let bends = bends.collect();
+        let last = self.last_length_mm.or(same.map(|f| f.last_length_mm)).unwrap_or(0.0);
+        Lra { bends, last_length_mm: last }
+    }
+
+    /// The same measurement read from the other end.
+    pub fn reversed(&self) -> MeasuredTube {
+        let n = self.bends.len();
+        let mut out = self.clone();
+        for i in 0..n {
+            let old = self.bends[n - 1 - i];
+            // The straight and the rotation before a bend, seen from the other end, are those after it.
+            let (length, sigma) = match i {
+                0 => (self.last_length_mm, self.last_length_sigma_mm),
+                _ => (self.bends[n - i].length_mm, self.bends[n - i].length_sigma_mm),
+            };
+            let (rotation, rotation_sigma) = match i {
+                0 => (Some(0.0), Some(0.0)),
+                _ => (self.bends[n - i].rotation_rad, self.bends[n - i].rotation_sigma_rad),
+            };
+            out.bends[i] = MeasuredBend {
+                length_mm: length,
+                length_sigma_mm: sigma,
+                rotation_rad: rotation,
+                rotation_sigma_rad: rotation_sigma,
+                ..old
+            };
+        }
+        if let Some(first) = self.bends.first() {
+            out.last_length_mm = first.length_mm;
+            out.last_length_sigma_mm = first.length_sigma_mm;
+        }
+        out.intersection_mm.reverse();
+        out.intersection_sigma_mm.reverse();
+        out
+    }
+}
