@@ -49,6 +49,10 @@ const LEAST_TURN: f64 = 2e-3;
 /// Places at which each interval of centres is tried.
 const TRIES: usize = 9;
 
+/// The curve may be this much longer or shorter than the polygon: a shallow corner must not be taken for a
+/// nearly full turn the other way round, whose loop no vertex lies on.
+const LENGTH_SHARE: f64 = 0.1;
+
 /// One family of arcs: centre = base + lambda * along, radius = base_radius + lambda * slope.
 struct Family {
     base: Vec2,
@@ -74,6 +78,9 @@ pub fn solve(chain: &Chain) -> Option<Found> {
     let tried = allowed.iter().flat_map(|&(low, high)| {
         (0..TRIES).map(move |k| low + (high - low) * (k as f64 + 0.5) / TRIES as f64)
     });
+    let length = chain.length();
+    let slack = LENGTH_SHARE * length + 2.0 * chain.tolerance_mm;
+    let tried = tried.filter(|&lambda| (family.length(lambda) - length).abs() < slack);
     let error =
         |lambda: f64| chain.points.iter().map(|(p, _)| family.distance(p, lambda).powi(2)).sum::<f64>();
     let (lambda, squared_error) = tried.map(|l| (l, error(l))).min_by(|a, b| a.1.total_cmp(&b.1))?;
@@ -86,6 +93,15 @@ pub fn solve(chain: &Chain) -> Option<Found> {
         angle_rad: family.angle,
         squared_error,
     })
+}
+
+impl Chain {
+    /// Length of the polygon from the start of the first line to the end of the second.
+    fn length(&self) -> f64 {
+        let inner = self.points.iter().map(|(p, _)| *p);
+        let all: Vec<Vec2> = [Vec2::zeros()].into_iter().chain(inner).chain([self.finish]).collect();
+        all.windows(2).map(|w| (w[1] - w[0]).norm()).sum()
+    }
 }
 
 impl Family {
@@ -111,6 +127,13 @@ impl Family {
         (self.base + self.along * lambda, self.base_radius + self.slope * lambda)
     }
 
+    /// Length of line, arc, line.
+    fn length(&self, lambda: f64) -> f64 {
+        let (centre, radius) = self.circle(lambda);
+        // The end of the arc lies at (centre . out) along the second line.
+        centre.x + radius * self.angle + (self.finish - centre).dot(&self.out)
+    }
+
     /// Interval of lambda in which the radius is allowed and the arc lies between the ends of both lines.
     fn bounds(&self, chain: &Chain) -> Option<(f64, f64)> {
         let reach = chain.points.iter().map(|(p, _)| p.norm()).fold(self.finish.norm(), f64::max);
@@ -130,7 +153,6 @@ impl Family {
         require(self.base_radius - chain.min_radius_mm, self.slope);
         require(20.0 * reach - self.base_radius, -self.slope);
         require(self.base.x - chain.begin_at + chain.tolerance_mm, self.along.x);
-        // The end of the arc lies at (centre . out) along the second line.
         let left = (self.finish - self.base).dot(&self.out) + chain.tolerance_mm;
         require(left, -self.along.dot(&self.out));
         (interval.0 < interval.1).then_some(interval)

@@ -55,6 +55,18 @@ pub struct Effort {
     pub rounds: usize,
     /// Steps per round.
     pub steps: usize,
+    /// What bend radii are expected, for bends too shallow to know their own.
+    pub prior: Option<RadiusPrior>,
+}
+
+/// A weak expectation of the bend radii. It keeps shallow bends from running away and counts as nothing in the
+/// covariance: a radius that the data does not carry stays unknown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RadiusPrior {
+    /// Expected CLR.
+    pub radius_mm: f64,
+    /// Its standard deviation.
+    pub spread_mm: f64,
 }
 
 /// Fits the model to the sample. The cut-off shrinks from `effort.cutoff_mm` to six standard deviations.
@@ -62,7 +74,7 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
     let parameters = start.parameters();
     let mut cutoff = effort.cutoff_mm;
     let mut passes = 0;
-    let mut state = descend(sample, start.clone(), &parameters, cutoff, effort.steps);
+    let mut state = descend(sample, start.clone(), &parameters, cutoff, &effort);
     passes += state.passes;
     for _ in 0..effort.rounds {
         let sigma = robust_sigma(&sample.residuals(&state.model), cutoff);
@@ -71,7 +83,7 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
             break;
         }
         cutoff = next;
-        state = descend(sample, state.model, &parameters, cutoff, effort.steps);
+        state = descend(sample, state.model, &parameters, cutoff, &effort);
         passes += state.passes;
     }
     let sigma_mm = robust_sigma(&sample.residuals(&state.model), cutoff);
@@ -113,13 +125,21 @@ fn descend(
     start: TubeModel,
     parameters: &[Parameter],
     cutoff: f64,
-    steps: usize,
+    effort: &Effort,
 ) -> Descent {
+    let noise = cutoff / CUTOFF_SIGMAS;
+    let total =
+        |model: &TubeModel, pass: &Pass| pass.cost + effort.prior.map_or(0.0, |p| p.cost(model, noise));
     let mut model = start;
     let mut pass = sample.pass(&model, cutoff);
+    let mut cost = total(&model, &pass);
     let (mut passes, mut damping) = (1, 1e-4);
-    for _ in 0..steps {
-        let (normal, gradient) = pass.normal_equations(&model.motions(parameters), parameters);
+    for _ in 0..effort.steps {
+        let (mut normal, mut gradient) = pass.normal_equations(&model.motions(parameters), parameters);
+        if let Some(prior) = &effort.prior {
+            prior.add_to(&model, parameters, noise, &mut normal, &mut gradient);
+        }
+        freeze_at_bounds(&model, parameters, &mut normal, &mut gradient);
         let mut improved = false;
         while damping < 1e8 {
             let Some(step) = damped_step(&normal, &gradient, damping) else {
@@ -127,17 +147,18 @@ fn descend(
                 continue;
             };
             // Predicted gain far below the noise of the cost itself: nothing left to win.
-            if 0.5 * -gradient.dot(&step) < 1e-9 * pass.cost.max(1e-12) {
+            if 0.5 * -gradient.dot(&step) < 1e-9 * cost.max(1e-12) {
                 return Descent { model, pass, passes, stop: Stop::Converged };
             }
             let next = model.stepped(parameters, &step);
             let next_pass = sample.pass(&next, cutoff);
+            let next_cost = total(&next, &next_pass);
             passes += 1;
-            if next_pass.cost < pass.cost {
-                let gain = (pass.cost - next_pass.cost) / pass.cost;
-                (model, pass) = (next, next_pass);
+            if next_cost < cost {
+                let gain = (cost - next_cost) / cost;
+                (model, pass, cost) = (next, next_pass, next_cost);
                 damping = (damping * 0.1).max(1e-9);
-                if gain < 1e-8 {
+                if gain < 1e-7 {
                     return Descent { model, pass, passes, stop: Stop::Converged };
                 }
                 improved = true;
@@ -150,6 +171,55 @@ fn descend(
         }
     }
     Descent { model, pass, passes, stop: Stop::Iterations }
+}
+
+impl RadiusPrior {
+    fn cost(&self, model: &TubeModel, noise_mm: f64) -> f64 {
+        let off = |radius: f64| (radius - self.radius_mm) / self.spread_mm * noise_mm;
+        model.lra.bends.iter().map(|b| 0.5 * off(b.radius_mm).powi(2)).sum()
+    }
+
+    fn add_to(
+        &self,
+        model: &TubeModel,
+        parameters: &[Parameter],
+        noise_mm: f64,
+        normal: &mut DMatrix<f64>,
+        gradient: &mut DVector<f64>,
+    ) {
+        let weight = (noise_mm / self.spread_mm).powi(2);
+        for (j, parameter) in parameters.iter().enumerate() {
+            if let Parameter::BendRadius(i) = *parameter {
+                normal[(j, j)] += weight;
+                gradient[j] += weight * (model.lra.bends[i].radius_mm - self.radius_mm);
+            }
+        }
+    }
+}
+
+/// Takes parameters that stand at a bound and would cross it out of the step.
+fn freeze_at_bounds(
+    model: &TubeModel,
+    parameters: &[Parameter],
+    normal: &mut DMatrix<f64>,
+    gradient: &mut DVector<f64>,
+) {
+    for (j, parameter) in parameters.iter().enumerate() {
+        let at_bound = match *parameter {
+            Parameter::Length(i) => model.lra.bends[i].length_mm <= 0.0,
+            Parameter::Angle(i) => model.lra.bends[i].angle_rad <= 0.0,
+            Parameter::BendRadius(i) => model.lra.bends[i].radius_mm <= model.tube_radius_mm,
+            _ => false,
+        };
+        // A positive gradient pulls the value down.
+        if at_bound && gradient[j] > 0.0 {
+            let diagonal = normal[(j, j)].max(1e-300);
+            normal.row_mut(j).fill(0.0);
+            normal.column_mut(j).fill(0.0);
+            normal[(j, j)] = diagonal;
+            gradient[j] = 0.0;
+        }
+    }
 }
 
 /// Marquardt's step: damping in proportion to each parameter's own curvature.

@@ -9,6 +9,7 @@ pub mod arcline;
 pub mod crust;
 pub mod cylinder;
 mod ends;
+mod evidence;
 pub mod fit;
 mod measure;
 pub mod mls;
@@ -133,7 +134,11 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         .ok_or_else(|| ReconstructError::NotBent { length_mm: crust::length_mm(&polygon), radius_mm })?;
     let model = chosen.fit.model;
     let mut all = Sample::new(cloud.iter().collect(), &model);
-    let mut best = fit(&mut all, &model, Effort { cutoff_mm: chosen.fit.cutoff_mm, rounds: 2, steps: 20 });
+    let mut best = fit(
+        &mut all,
+        &model,
+        Effort { cutoff_mm: chosen.fit.cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior },
+    );
     if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
         let bends = best.model.lra.bends.len();
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
