@@ -3,6 +3,7 @@
 //! criterion): a bend dropped, two merged into one, one put in where the residuals show a kink.
 
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
 use super::evidence;
@@ -20,6 +21,12 @@ const ARC_FACTOR: f64 = 2.5;
 
 /// First cut-off of residuals in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
+
+/// First cut-off after a small change of the structure.
+const CHANGE_CUTOFF: f64 = 0.15;
+
+/// A change must gain this much, or rounding could turn it back for ever.
+const LEAST_GAIN: f64 = 1e-6;
 
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
@@ -46,6 +53,8 @@ const TRIAL_RAD: f64 = 0.02;
 pub struct Candidate {
     /// The fit to the sample.
     pub fit: Fit,
+    /// The sample with each point at its segment.
+    sample: Sample,
     /// Information criterion: smaller is better.
     pub score: f64,
     /// Expectation of the bend radii that it was fitted with.
@@ -65,49 +74,54 @@ struct Jury<'a> {
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -> Option<Candidate> {
     let mut jury = Jury { sample, sigma_mm: 0.0, correlation: 1.0, prior: None };
-    let mut fits: Vec<Fit> = Vec::new();
+    let mut fits: Vec<(Fit, Sample)> = Vec::new();
     for tolerance in TOLERANCES {
         let kept: Vec<Point3<f64>> =
             simplify(polygon, tolerance * radius_mm).into_iter().map(|i| polygon[i]).collect();
         let limits = Limits { tolerance_mm: ARC_FACTOR * tolerance * radius_mm, min_radius_mm: radius_mm };
         let Some((lra, start)) = approximate(&kept, limits) else { continue };
-        let model = TubeModel { start, lra, tube_radius_mm: radius_mm, common_radius: false };
-        fits.push(jury.fit(&model));
+        let model = TubeModel::round(start, lra, radius_mm);
+        fits.push(jury.fit(Sample::new(sample.to_vec(), &model), &model, FIRST_CUTOFF * radius_mm));
     }
-    jury.calibrate(fits.iter().min_by(|a, b| a.sigma_mm.total_cmp(&b.sigma_mm))?);
-    let best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
+    let clearest = fits.iter().min_by(|a, b| a.0.sigma_mm.total_cmp(&b.0.sigma_mm))?;
+    jury.calibrate(&clearest.0, &clearest.1);
+    let mut best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&best.fit.model);
-    let mut best = jury.judge(jury.fit(&best.fit.model));
+    best = jury.judge(jury.refit(&best, &best.fit.model));
     for _ in 0..ROUNDS {
         let Some(better) = jury.improve(&best) else { break };
-        jury.calibrate(&better.fit);
-        best = jury.judge(better.fit);
+        jury.calibrate(&better.fit, &better.sample);
+        best = jury.judge((better.fit, better.sample));
     }
-    let common = jury.judge(jury.fit(&with_common_radius(&best.fit.model)));
+    let common = jury.judge(jury.refit(&best, &with_common_radius(&best.fit.model)));
     Some(if common.score < best.score { common } else { best })
 }
 
 impl Jury<'_> {
-    fn fit(&self, model: &TubeModel) -> Fit {
-        let cutoff_mm = FIRST_CUTOFF * model.tube_radius_mm;
-        let effort = Effort { cutoff_mm, rounds: 4, steps: 30, prior: self.prior };
-        fit(&mut Sample::new(self.sample.to_vec(), model), model, effort)
+    fn fit(&self, mut sample: Sample, model: &TubeModel, cutoff_mm: f64) -> (Fit, Sample) {
+        let fit = fit(&mut sample, model, Effort { cutoff_mm, rounds: 4, steps: 30, prior: self.prior });
+        (fit, sample)
     }
 
-    fn judge(&self, fit: Fit) -> Candidate {
-        let pass = Sample::new(self.sample.to_vec(), &fit.model).pass(&fit.model, 6.0 * self.sigma_mm);
+    /// Fits a model that is a small change of the best one's.
+    fn refit(&self, best: &Candidate, model: &TubeModel) -> (Fit, Sample) {
+        let cutoff = (CHANGE_CUTOFF * model.tube_radius_mm).max(2.0 * best.fit.cutoff_mm);
+        self.fit(best.sample.follow(&best.fit.model, model), model, cutoff)
+    }
+
+    fn judge(&self, (fit, mut sample): (Fit, Sample)) -> Candidate {
+        let pass = sample.pass(&fit.model, 6.0 * self.sigma_mm);
         let misfit = 2.0 * pass.cost / (self.sigma_mm * self.sigma_mm) / self.correlation;
         let independent = self.sample.len() as f64 / self.correlation;
         let score = misfit + fit.parameters.len() as f64 * independent.ln();
-        Candidate { fit, score, prior: self.prior }
+        Candidate { fit, sample, score, prior: self.prior }
     }
 
     /// Takes noise and correlation from a fit.
-    fn calibrate(&mut self, fit: &Fit) {
-        let sample = Sample::new(self.sample.to_vec(), &fit.model);
+    fn calibrate(&mut self, fit: &Fit, sample: &Sample) {
         let station = STATION_RADII * fit.model.tube_radius_mm;
         self.sigma_mm = fit.sigma_mm;
-        self.correlation = evidence::correlation(&sample, &fit.model, station, fit.cutoff_mm, fit.sigma_mm);
+        self.correlation = evidence::correlation(sample, &fit.model, station, fit.cutoff_mm, fit.sigma_mm);
     }
 
     /// The best of all changes by one bend, when it scores better.
@@ -117,19 +131,25 @@ impl Jury<'_> {
         let dropped =
             (0..n).filter(|&i| model.lra.bends[i].angle_rad < DROP_RAD).map(|i| without_bend(model, i));
         let merged = (1..n).filter_map(|i| merged(model, i));
-        let inserted = self.kinks(&best.fit).into_iter().map(|(at, offset)| with_bend(model, at, &offset));
-        let tried = dropped.chain(merged).chain(inserted.flatten());
+        let kinks = self.kinks(best);
+        let inserted = kinks.iter().flat_map(|(at, offset)| with_bend(model, *at, offset));
+        let split = kinks.iter().flat_map(|(at, _)| split(model, *at));
+        let tried: Vec<TubeModel> = dropped.chain(merged).chain(inserted).chain(split).collect();
         tried
-            .map(|m| self.judge(self.fit(&m)))
-            .filter(|c| c.score < best.score)
+            .into_par_iter()
+            .map(|m| self.judge(self.refit(best, &m)))
+            .collect::<Vec<_>>()
+            .into_iter()
+            .filter(|c| c.score < best.score - LEAST_GAIN)
             .min_by(|a, b| a.score.total_cmp(&b.score))
     }
 
     /// Places where the points lie beside the model, the clearest first, no two close together.
-    fn kinks(&self, fit: &Fit) -> Vec<(f64, Vector3<f64>)> {
-        let sample = Sample::new(self.sample.to_vec(), &fit.model);
+    fn kinks(&self, best: &Candidate) -> Vec<(f64, Vector3<f64>)> {
+        let fit = &best.fit;
         let station = STATION_RADII * fit.model.tube_radius_mm;
-        let mut offsets = evidence::offsets(&sample, &fit.model, station, 4.0 * fit.cutoff_mm, self.sigma_mm);
+        let mut offsets =
+            evidence::offsets(&best.sample, &fit.model, station, 4.0 * fit.cutoff_mm, self.sigma_mm);
         offsets.retain(|o| o.chi2 > KINK_CHI2 * self.correlation);
         offsets.sort_by(|a, b| b.chi2.total_cmp(&a.chi2).then(a.at_mm.total_cmp(&b.at_mm)));
         let mut out: Vec<(f64, Vector3<f64>)> = Vec::new();
@@ -165,10 +185,16 @@ fn with_common_radius(model: &TubeModel) -> TubeModel {
 /// The tube with bend `i` pulled straight.
 fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
     let mut out = model.clone();
-    let bend = &mut out.lra.bends[i];
-    bend.length_mm += bend.radius_mm * bend.angle_rad;
-    bend.angle_rad = 0.0;
-    out.lra = out.lra.merged();
+    let gone = out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
+    let length = gone.length_mm + gone.radius_mm * gone.angle_rad;
+    match out.lra.bends.get_mut(i) {
+        Some(next) => {
+            next.length_mm += length;
+            next.rotation_rad += gone.rotation_rad;
+        }
+        None => out.lra.last_length_mm += length,
+    }
     turn_into_pose(&mut out);
     out
 }
@@ -193,10 +219,34 @@ fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
     let radius_mm = (arcs + other.length_mm) / angle_rad;
     out.lra.bends[i - 1] = Bend { angle_rad, radius_mm, ..one };
     out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
     if let Some(next) = out.lra.bends.get_mut(i) {
         next.rotation_rad += other.rotation_rad;
     }
     Some(out)
+}
+
+/// The bends at (or just beside) an arc length, each as two with a short straight between.
+fn split(model: &TubeModel, at_mm: f64) -> Vec<TubeModel> {
+    let spine = model.spine();
+    let near = 1.5 * model.tube_radius_mm;
+    let arcs = spine.segments().iter().enumerate().filter(|(k, s)| {
+        k % 2 == 1
+            && s.length_mm > 0.0
+            && (s.start_mm - near..s.start_mm + s.length_mm + near).contains(&at_mm)
+    });
+    arcs.map(|(k, segment)| {
+        let mut out = model.clone();
+        let share = ((at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
+        let whole = out.lra.bends[k / 2];
+        let straight = 0.1 * model.tube_radius_mm;
+        out.lra.bends[k / 2].angle_rad *= share;
+        let angle_rad = whole.angle_rad * (1.0 - share);
+        out.lra.bends.insert(k / 2 + 1, Bend { length_mm: straight, rotation_rad: 0.0, angle_rad, ..whole });
+        out.ovality_mm.insert(k / 2, model.ovality_mm[k / 2]);
+        out
+    })
+    .collect()
 }
 
 /// The tube with a shallow bend more at (or beside) an arc length, turning against the offset that the points
@@ -232,6 +282,7 @@ fn insert(model: &TubeModel, row: usize, along_mm: f64, offset: &Vector3<f64>) -
         None => out.lra.last_length_mm = (out.lra.last_length_mm - used).max(0.0),
     }
     out.lra.bends.insert(row, bend);
+    out.ovality_mm.insert(row, 0.0);
     turn_into_pose(&mut out);
     out
 }
