@@ -4,6 +4,7 @@
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
 mod reconstruct;
+mod simulate;
 
 use std::process::ExitCode;
 
@@ -23,6 +24,8 @@ struct Cli {
 enum Command {
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
+    /// Runs a simulator on its own.
+    Simulate(simulate::Args),
 }
 
 /// Units in which scan files come.
@@ -63,6 +66,7 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
