@@ -79,6 +79,13 @@ pub fn next(model: &Model, nominal: &Nominal, newest: &Used, limits: &Limits) ->
     (0..nominal.lra.bends.len()).for_each(|i| plan.angle(i));
     (0..nominal.lra.bends.len()).for_each(|i| plan.rotation(i));
     plan.lengths();
+    for (i, off_mm) in model.lengths.slips() {
+        let text = format!(
+            "feed {}: {off_mm:+.2} mm off what was expected: mostly slip of a worn clamp; not chased unless it stays",
+            i + 1
+        );
+        plan.reasons.push(Reason::at(Code::Slip, i, text));
+    }
     (plan.table, plan.reasons)
 }
 
