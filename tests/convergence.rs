@@ -8,7 +8,7 @@ mod common;
 use benderd::config::{Document, Materials, parse_part};
 use benderd::correct::{Answer, History, Knowledge, Limits, Part, Verdict, step};
 use benderd::inspect::{State, inspect};
-use benderd::sim::Plant;
+use benderd::sim::forming::Plant;
 use benderd::tube::{CommandTable, Lra, MeasuredTube, Nominal};
 use common::measured;
 use rand::SeedableRng;

@@ -8,7 +8,7 @@ use std::path::Path;
 use assert_cmd::Command;
 use benderd::config::{Document, Materials, parse_part};
 use benderd::correct::{Answer, Code, History, Knowledge, Limits, Part, Verdict, learn, step, store};
-use benderd::sim::Plant;
+use benderd::sim::forming::Plant;
 use benderd::tube::{Bend, CommandTable, Lra, MeasuredTube, Nominal};
 use common::measured;
 use proptest::prelude::*;
