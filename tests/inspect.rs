@@ -5,8 +5,10 @@ mod common;
 use std::fs;
 
 use assert_cmd::Command;
+use benderd::cloud::write_scan;
 use benderd::config::{Document, Materials, parse_part};
 use benderd::inspect::{Inspection, Place, State, Verdict, inspect, judge};
+use benderd::sim::scan::{self, Density, ScanSettings, TubeShape};
 use benderd::tube::{Alignment, Bend, Lra, MeasuredTube, Nominal};
 use common::measured;
 use proptest::prelude::*;
@@ -376,6 +378,25 @@ fn the_command_prints_a_table_and_a_verdict() {
     let value: serde_json::Value = serde_json::from_str(&text).unwrap();
     assert_eq!((code, value["verdict"].as_str()), (Some(1), Some("out_of_tolerance")));
     assert!((value["bends"][1]["angle_deg"]["deviation"].as_f64().unwrap() + 2.0).abs() < 1e-9);
+}
+
+#[test]
+fn the_command_inspects_a_scan() {
+    let dir = tempfile::tempdir().unwrap();
+    let part = concat!(env!("CARGO_MANIFEST_DIR"), "/config/parts/bracket-17.toml");
+    let file = dir.path().join("scan.ply");
+    let mut tube = bracket().lra;
+    tube.bends[1].angle_rad -= 2.0_f64.to_radians();
+    let shape = TubeShape::round(tube.reversed(), 25.4);
+    let settings = ScanSettings { density: Density::Points(30_000), views: 2, ..ScanSettings::default() };
+    write_scan(&file, &scan::scan(&shape, &settings, 1).cloud()).unwrap();
+    let mut command = Command::cargo_bin("benderd").unwrap();
+    let out = command.arg("inspect").arg(&file).args(["--nominal", part, "--json"]).output().unwrap();
+    assert_eq!(out.status.code(), Some(1), "{}", String::from_utf8_lossy(&out.stderr));
+    let found: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(found["verdict"], "out_of_tolerance");
+    let off = found["bends"][1]["angle_deg"]["deviation"].as_f64().unwrap();
+    assert!((off + 2.0).abs() < 0.1, "{found}");
 }
 
 #[test]
