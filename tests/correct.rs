@@ -1,5 +1,7 @@
 //! `benderd correct` as its contract promises: verdicts, refusals, knowledge, and the JSON around them.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 mod common;
 
 use std::fs;

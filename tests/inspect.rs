@@ -1,5 +1,7 @@
 //! Inspection as a user relies on it: what is accepted, what is refused, and what is said about it.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 mod common;
 
 use std::fs;
