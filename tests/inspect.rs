@@ -141,6 +141,28 @@ fn angles_are_judged_with_a_guard_band() {
     assert_eq!(judge(-0.75 - 1e-9, 0.5, 0.125), State::Out);
 }
 
+#[test]
+fn a_doubtful_length_or_turn_leaves_the_decision_to_the_check_points() {
+    // Found in the loop with simulated scans: an end known to 0.2 mm, off by 0.5 where 0.8 is allowed.
+    let mut tube = bracket().lra;
+    tube.bends[0].length_mm -= 0.5;
+    let mut scan = measured(&tube, 0.02);
+    scan.intersection_sigma_mm[0] = Some(0.2);
+    let found = inspect(&scan, &bracket()).unwrap();
+    assert_eq!(found.bends[0].length_mm.state, Some(State::Uncertain));
+    assert_eq!(found.verdict, Verdict::InTolerance, "{}", found.advice);
+    // Out for certain is out, though every check point is within 1.5 mm.
+    tube.bends[0].length_mm -= 0.5;
+    let found = inspect(&measured(&tube, 0.02), &bracket()).unwrap();
+    assert!(found.points.iter().all(|p| p.state == State::In));
+    assert_eq!(found.verdict, Verdict::OutOfTolerance);
+    assert!(
+        found.advice.contains("length of straight 1 is off by -1.00 (tolerance 0.8)"),
+        "{}",
+        found.advice
+    );
+}
+
 /// The same corners with other radii.
 fn grown(tube: &Lra, share: f64) -> Lra {
     let mut out = tube.clone();
