@@ -3,6 +3,9 @@
 //! Exit status: 0 done, 1 the tube or the machine said no, 2 the input or the arguments are unusable. Errors go
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
+mod convert;
+mod correct;
+mod inspect;
 mod reconstruct;
 mod simulate;
 
@@ -26,6 +29,12 @@ enum Command {
     Reconstruct(reconstruct::Args),
     /// Runs a simulator on its own.
     Simulate(simulate::Args),
+    /// Compares a measured tube with its part: deviations and verdict.
+    Inspect(inspect::Args),
+    /// One step of the correction loop: from what was measured to the next table.
+    Correct(correct::Args),
+    /// Converts bending tables between LRA, XYZ and YBC.
+    Convert(convert::Args),
 }
 
 /// Units in which scan files come.
@@ -67,6 +76,9 @@ pub fn main() -> ExitCode {
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
         Command::Simulate(args) => simulate::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Correct(args) => correct::run(&args),
+        Command::Convert(args) => convert::run(&args),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

@@ -1,4 +1,5 @@
 //! Simulated tube, scan arm and bender: stand-ins for the hardware that share nothing with the estimators.
 
+pub mod forming;
 pub mod population;
 pub mod scan;
