@@ -239,7 +239,7 @@ fn unit_diagonal(matrix: &DMatrix<f64>) -> (DMatrix<f64>, DVector<f64>) {
 }
 
 /// Inverse of a normal matrix; directions that the data does not see get a huge, finite variance.
-fn invert(matrix: &DMatrix<f64>) -> DMatrix<f64> {
+pub fn invert(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     let (mut scaled, scale) = unit_diagonal(matrix);
     let n = scale.len();
     for exponent in -15..0 {

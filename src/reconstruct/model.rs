@@ -206,7 +206,7 @@ fn join(velocity: Vector3<f64>, angular: Vector3<f64>) -> Vector6<f64> {
 }
 
 /// The same twist seen from `frame`.
-fn in_frame(twist: &Vector6<f64>, frame: &Frame) -> Vector6<f64> {
+pub fn in_frame(twist: &Vector6<f64>, frame: &Frame) -> Vector6<f64> {
     let (velocity, angular) = (twist.fixed_rows::<3>(0).into_owned(), twist.fixed_rows::<3>(3).into_owned());
     let at_origin = velocity + angular.cross(&frame.translation.vector);
     join(frame.rotation.inverse() * at_origin, frame.rotation.inverse() * angular)

@@ -18,10 +18,10 @@ use crate::tube::SegmentKind;
 const CHUNK: usize = 4096;
 
 /// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
-const ROWS: usize = 9;
+pub const ROWS: usize = 9;
 
 /// The derivatives and the residual, squared.
-type Moment = SMatrix<f64, 10, 10>;
+pub type Moment = SMatrix<f64, 10, 10>;
 
 /// A section turns from round to oval over this many tube radii at both ends of a bend.
 const OVAL_RAMP_RADII: f64 = 1.0;
@@ -61,6 +61,17 @@ pub struct Pass {
     psi_slope: f64,
     /// Points with weight above zero.
     pub used: usize,
+}
+
+/// The moment of one piece of a segment.
+#[derive(Debug, Clone)]
+pub struct Station {
+    /// The segment.
+    pub segment: usize,
+    /// Arc length at which the piece ends.
+    pub end_mm: f64,
+    /// Squared derivatives and residuals, lower triangle, in the segment's frame.
+    pub moment: Moment,
 }
 
 /// Points with the segment that each belongs to, kept from pass to pass.
@@ -116,22 +127,58 @@ impl Sample {
     /// Sums residuals and their derivatives with the biweight of cut-off `cutoff_mm`.
     pub fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
         let locals = prepare(model);
-        let radius = model.tube_radius_mm;
+        self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, locals.len(), |segment, _| segment)
+    }
+
+    /// The same with every segment cut into stations of about the given length.
+    pub fn pass_by_station(&mut self, model: &TubeModel, cutoff_mm: f64, station_mm: f64) -> Vec<Station> {
+        let spine = model.spine();
+        let counts = spine.segments().iter().map(|s| (s.length_mm / station_mm).ceil().max(1.0) as usize);
+        let counts: Vec<usize> = counts.collect();
+        let first: Vec<usize> = counts
+            .iter()
+            .scan(0, |next, n| {
+                *next += n;
+                Some(*next - n)
+            })
+            .collect();
+        let total = counts.iter().sum();
+        let locals = prepare(model);
+        let pass = self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, total, |k, p| {
+            let share = locals[k].along_mm(p) / locals[k].length_mm.max(1e-12);
+            first[k] + ((share * counts[k] as f64) as usize).min(counts[k] - 1)
+        });
+        let stations = spine.segments().iter().enumerate().flat_map(|(segment, s)| {
+            let n = counts[segment];
+            (0..n).map(move |i| (segment, s.start_mm + s.length_mm * (i + 1) as f64 / n as f64))
+        });
+        let with_moment = stations.zip(pass.moments);
+        with_moment.map(|((segment, end_mm), moment)| Station { segment, end_mm, moment }).collect()
+    }
+
+    fn pass_by(
+        &mut self,
+        locals: &[Local],
+        tube_radius_mm: f64,
+        cutoff_mm: f64,
+        bins: usize,
+        bin: impl Fn(usize, &Point3<f64>) -> usize + Sync,
+    ) -> Pass {
         let chunks: Vec<Pass> = self
             .points
             .par_chunks(CHUNK)
             .zip(self.segment.par_chunks_mut(CHUNK))
             .map(|(points, segments)| {
-                let mut pass = Pass::empty(locals.len());
+                let mut pass = Pass::empty(bins);
                 for (p, segment) in points.iter().zip(segments) {
-                    let local = settle(p, segment, &locals);
-                    let sight = see(&local, &locals[*segment as usize], radius);
-                    pass.add(*segment as usize, &sight, cutoff_mm);
+                    let local = settle(p, segment, locals);
+                    let k = *segment as usize;
+                    pass.add(bin(k, &local), &see(&local, &locals[k], tube_radius_mm), cutoff_mm);
                 }
                 pass
             })
             .collect();
-        let mut total = Pass::empty(locals.len());
+        let mut total = Pass::empty(bins);
         chunks.iter().for_each(|c| total.merge(c));
         total
     }
@@ -184,22 +231,11 @@ impl Pass {
         parameters: &[Parameter],
     ) -> (DMatrix<f64>, DVector<f64>) {
         let n = parameters.len();
-        let radius = parameters.iter().position(|p| *p == Parameter::TubeRadius);
         let (mut matrix, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
         for (moment, motion) in self.moments.iter().zip(motions) {
             let mut moment = *moment;
             moment.fill_upper_triangle_with_lower_triangle();
-            let mut basis = DMatrix::zeros(ROWS, n);
-            basis.rows_mut(0, 6).copy_from(&motion.twists);
-            if let Some(own) = motion.own_radius {
-                basis[(6, own)] = 1.0;
-            }
-            if let Some(own) = motion.own_ovality {
-                basis[(7, own)] = 1.0;
-            }
-            if let Some(radius) = radius {
-                basis[(8, radius)] = 1.0;
-            }
+            let basis = motion.basis(parameters);
             matrix += basis.transpose() * (moment.fixed_view::<ROWS, ROWS>(0, 0) * &basis);
             gradient += basis.transpose() * moment.fixed_view::<ROWS, 1>(0, ROWS);
         }
@@ -212,6 +248,21 @@ impl Pass {
         let n = self.used as f64;
         let freedom = n / (n - parameters as f64).max(1.0);
         freedom * self.psi_squared * self.weight / self.psi_slope.max(1e-12).powi(2)
+    }
+}
+
+impl SegmentMotion {
+    /// How the derivatives that a moment holds follow from the parameters.
+    pub fn basis(&self, parameters: &[Parameter]) -> DMatrix<f64> {
+        let mut basis = DMatrix::zeros(ROWS, parameters.len());
+        basis.rows_mut(0, 6).copy_from(&self.twists);
+        let radius = parameters.iter().position(|p| *p == Parameter::TubeRadius);
+        for (row, own) in [(6, self.own_radius), (7, self.own_ovality), (8, radius)] {
+            if let Some(column) = own {
+                basis[(row, column)] = 1.0;
+            }
+        }
+        basis
     }
 }
 
@@ -252,6 +303,17 @@ fn settle(p: &Point3<f64>, segment: &mut u32, locals: &[Local]) -> Point3<f64> {
 }
 
 impl Local {
+    /// Distance along the segment of the point's foot, clamped to it.
+    fn along_mm(&self, p: &Point3<f64>) -> f64 {
+        match &self.arc {
+            None => p.x.clamp(0.0, self.length_mm),
+            Some(arc) => {
+                let turn = p.x.atan2(arc.radius_mm - p.y).rem_euclid(std::f64::consts::TAU);
+                (turn * arc.radius_mm).min(self.length_mm)
+            }
+        }
+    }
+
     /// Before (-1), on (0) or after (1) the segment.
     fn side(&self, p: &Point3<f64>) -> i32 {
         match &self.arc {

@@ -6,12 +6,12 @@ use nalgebra::{Point3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
-use super::evidence;
+use super::evidence::{self, Joint};
 use super::fit::{Effort, Fit, RadiusPrior, fit};
 use super::model::TubeModel;
 use super::moments::Sample;
 use super::simplify::simplify;
-use crate::tube::{Bend, SegmentKind};
+use crate::tube::{Bend, Segment};
 
 /// Tolerances of the polygon in tube radii; the spine's own shrinkage in bends is 0.038 (paper 000, section 3.2).
 const TOLERANCES: [f64; 4] = [0.03, 0.05, 0.08, 0.13];
@@ -39,14 +39,14 @@ const MERGE_RAD: f64 = 0.6;
 
 /// Length of a station of the residuals in tube radii, and the evidence that makes a bend be tried there.
 const STATION_RADII: f64 = 1.0;
-const KINK_CHI2: f64 = 25.0;
+const JOINT_GAIN: f64 = 40.0;
 
-/// Kinks tried per round, and rounds.
-const KINKS: usize = 3;
+/// Joints tried per round, and rounds.
+const JOINTS: usize = 3;
 const ROUNDS: usize = 40;
 
-/// First angle of a bend that is tried.
-const TRIAL_RAD: f64 = 0.02;
+/// Smallest first angle of a bend that is tried.
+const TRIAL_RAD: f64 = 0.01;
 
 /// A fitted structure.
 #[derive(Debug, Clone)]
@@ -131,9 +131,9 @@ impl Jury<'_> {
         let dropped =
             (0..n).filter(|&i| model.lra.bends[i].angle_rad < DROP_RAD).map(|i| without_bend(model, i));
         let merged = (1..n).filter_map(|i| merged(model, i));
-        let kinks = self.kinks(best);
-        let inserted = kinks.iter().flat_map(|(at, offset)| with_bend(model, *at, offset));
-        let split = kinks.iter().flat_map(|(at, _)| split(model, *at));
+        let joints = self.joints(best);
+        let inserted = joints.iter().flat_map(|j| with_bend(model, j));
+        let split = joints.iter().flat_map(|j| split(model, j));
         let tried: Vec<TubeModel> = dropped.chain(merged).chain(inserted).chain(split).collect();
         tried
             .into_par_iter()
@@ -144,18 +144,19 @@ impl Jury<'_> {
             .min_by(|a, b| a.score.total_cmp(&b.score))
     }
 
-    /// Places where the points lie beside the model, the clearest first, no two close together.
-    fn kinks(&self, best: &Candidate) -> Vec<(f64, Vector3<f64>)> {
-        let fit = &best.fit;
-        let station = STATION_RADII * fit.model.tube_radius_mm;
-        let mut offsets =
-            evidence::offsets(&best.sample, &fit.model, station, 4.0 * fit.cutoff_mm, self.sigma_mm);
-        offsets.retain(|o| o.chi2 > KINK_CHI2 * self.correlation);
-        offsets.sort_by(|a, b| b.chi2.total_cmp(&a.chi2).then(a.at_mm.total_cmp(&b.at_mm)));
-        let mut out: Vec<(f64, Vector3<f64>)> = Vec::new();
-        for o in offsets {
-            if out.len() < KINKS && out.iter().all(|(at, _)| (at - o.at_mm).abs() > 3.0 * station) {
-                out.push((o.at_mm, o.offset));
+    /// Places where a joint would help, the most helpful first, no two close together.
+    fn joints(&self, best: &Candidate) -> Vec<Joint> {
+        let radius = best.fit.model.tube_radius_mm;
+        let cutoff = 3.0 * best.fit.cutoff_mm;
+        let station = STATION_RADII * radius;
+        let mut joints =
+            evidence::joints(&mut best.sample.clone(), &best.fit, station, cutoff, self.sigma_mm);
+        joints.retain(|j| j.gain > JOINT_GAIN * self.correlation);
+        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
+        let mut out: Vec<Joint> = Vec::new();
+        for joint in joints {
+            if out.len() < JOINTS && out.iter().all(|o| (joint.at_mm - o.at_mm).abs() > 2.0 * radius) {
+                out.push(joint);
             }
         }
         out
@@ -226,60 +227,67 @@ fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
     Some(out)
 }
 
-/// The bends at (or just beside) an arc length, each as two with a short straight between.
-fn split(model: &TubeModel, at_mm: f64) -> Vec<TubeModel> {
+/// The bends at (or just beside) a joint, each as two with a straight between.
+fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
     let spine = model.spine();
     let near = 1.5 * model.tube_radius_mm;
     let arcs = spine.segments().iter().enumerate().filter(|(k, s)| {
-        k % 2 == 1
-            && s.length_mm > 0.0
-            && (s.start_mm - near..s.start_mm + s.length_mm + near).contains(&at_mm)
+        let reach = s.start_mm - near..s.start_mm + s.length_mm + near;
+        k % 2 == 1 && s.length_mm > 0.0 && reach.contains(&joint.at_mm)
     });
-    arcs.map(|(k, segment)| {
+    let apart = |(k, segment): (usize, &Segment)| {
         let mut out = model.clone();
-        let share = ((at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
+        let share = ((joint.at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
         let whole = out.lra.bends[k / 2];
-        let straight = 0.1 * model.tube_radius_mm;
+        let length_mm = joint.shift_mm.clamp(0.1 * model.tube_radius_mm, segment.length_mm);
         out.lra.bends[k / 2].angle_rad *= share;
         let angle_rad = whole.angle_rad * (1.0 - share);
-        out.lra.bends.insert(k / 2 + 1, Bend { length_mm: straight, rotation_rad: 0.0, angle_rad, ..whole });
+        let rotation_rad = joint.turn_rad.x.clamp(-0.5, 0.5);
+        out.lra.bends.insert(k / 2 + 1, Bend { length_mm, rotation_rad, angle_rad, ..whole });
         out.ovality_mm.insert(k / 2, model.ovality_mm[k / 2]);
         out
-    })
-    .collect()
+    };
+    arcs.map(apart).collect()
 }
 
-/// The tube with a shallow bend more at (or beside) an arc length, turning against the offset that the points
-/// show there. On an arc the straights beside it are tried.
-fn with_bend(model: &TubeModel, at_mm: f64, offset: &Vector3<f64>) -> Vec<TubeModel> {
+/// The tube with the shallow bend that a joint asks for. Where the joint lies on (or near the end of) an arc the
+/// straights beside it are tried.
+fn with_bend(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
     let spine = model.spine();
     let segments = spine.segments();
-    let hit = segments.partition_point(|s| s.start_mm + s.length_mm < at_mm).min(segments.len() - 1);
-    let lines = if segments[hit].kind == SegmentKind::Line { vec![hit] } else { vec![hit - 1, hit + 1] };
-    let place = |line: usize| {
-        let segment = &segments[line];
-        let along = (at_mm - segment.start_mm).clamp(0.1 * segment.length_mm, 0.9 * segment.length_mm);
-        insert(model, line / 2, along, &segment.start.inverse_transform_vector(offset))
+    let near = 1.5 * model.tube_radius_mm;
+    let lines = segments.iter().enumerate().filter(|(k, s)| {
+        let (from, to) = (s.start_mm - near, s.start_mm + s.length_mm + near);
+        let beside = |arc: Option<&Segment>| {
+            arc.is_some_and(|a| (a.start_mm..=a.start_mm + a.length_mm).contains(&joint.at_mm))
+        };
+        let next_to = (*k > 0 && beside(segments.get(k - 1))) || beside(segments.get(k + 1));
+        k % 2 == 0 && ((from..=to).contains(&joint.at_mm) || next_to)
+    });
+    let place = |(k, segment): (usize, &Segment)| {
+        let along = (joint.at_mm - segment.start_mm).clamp(0.1 * segment.length_mm, 0.9 * segment.length_mm);
+        insert(model, k / 2, along, joint)
     };
-    lines.into_iter().map(place).collect()
+    lines.map(place).collect()
 }
 
-/// Puts a bend into straight `row`; `offset` is seen from that straight's frame, whose y axis points to the centre
-/// of the bend after it.
-fn insert(model: &TubeModel, row: usize, along_mm: f64, offset: &Vector3<f64>) -> TubeModel {
+/// Puts a bend into straight `row`, turning as the joint does.
+fn insert(model: &TubeModel, row: usize, along_mm: f64, joint: &Joint) -> TubeModel {
     let mut out = model.clone();
     let radius_mm = mean_radius_mm(model).unwrap_or(6.0 * model.tube_radius_mm);
-    // The centre lies opposite to the offset. The row's frame has its rotation applied already.
-    let turn = (-offset.z).atan2(-offset.y);
+    let angle_rad = joint.turn_rad.yz().norm().clamp(TRIAL_RAD, 20.0 * TRIAL_RAD);
+    // The plane's normal (0, y, z) is the frame's z axis rolled about x.
+    let roll = (-joint.turn_rad.y).atan2(joint.turn_rad.z);
     let before = out.lra.bends.get(row).map_or(0.0, |b| b.rotation_rad);
-    let bend = Bend { length_mm: along_mm, rotation_rad: before + turn, angle_rad: TRIAL_RAD, radius_mm };
-    let used = along_mm + radius_mm * TRIAL_RAD;
+    let half = 0.5 * radius_mm * angle_rad;
+    let bend =
+        Bend { length_mm: (along_mm - half).max(0.0), rotation_rad: before + roll, angle_rad, radius_mm };
     match out.lra.bends.get_mut(row) {
         Some(next) => {
-            next.length_mm = (next.length_mm - used).max(0.0);
-            next.rotation_rad = -turn;
+            next.length_mm = (next.length_mm - along_mm - half).max(0.0);
+            next.rotation_rad = -roll;
         }
-        None => out.lra.last_length_mm = (out.lra.last_length_mm - used).max(0.0),
+        None => out.lra.last_length_mm = (out.lra.last_length_mm - along_mm - half).max(0.0),
     }
     out.lra.bends.insert(row, bend);
     out.ovality_mm.insert(row, 0.0);
