@@ -4,6 +4,8 @@
 //! once at most and never before an equal read-back and a journalled intent, and the outcome is true, also a
 //! while later. The same seed gives the same run.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::collections::BTreeMap;
 
 use benderd::bender::{

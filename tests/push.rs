@@ -1,6 +1,8 @@
 //! `benderd push` as a user meets it, against a simulated bender on a real socket: exit status, what is said,
 //! and what the machine holds afterwards.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
