@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::Subcommand;
 
-use super::Outcome;
+use super::{Outcome, simulate_bender};
 use crate::cloud::write_scan;
 use crate::config::{Materials, load_part};
 use crate::sim::scan::{Density, PointKind, ScanSettings, TubeShape, scan};
@@ -21,6 +21,8 @@ pub struct Args {
 enum Simulator {
     /// Scans a part as if it had been bent perfectly, with a simulated laser line.
     Scan(ScanArgs),
+    /// A bender with a real Modbus TCP server, until Ctrl-C.
+    Bender(simulate_bender::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -69,6 +71,7 @@ fn at_most<const MOST: u32>(word: &str) -> Result<f64, String> {
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     match &args.simulator {
         Simulator::Scan(args) => simulate_scan(args),
+        Simulator::Bender(args) => simulate_bender::run(args),
     }
 }
 

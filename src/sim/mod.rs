@@ -1,5 +1,7 @@
 //! Simulated tube, scan arm and bender: stand-ins for the hardware that share nothing with the estimators.
 
+pub mod bender;
+pub mod bender_server;
 pub mod forming;
 pub mod population;
 pub mod scan;
