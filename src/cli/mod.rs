@@ -4,6 +4,7 @@
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
 mod convert;
+mod inspect;
 mod reconstruct;
 
 use std::process::ExitCode;
@@ -22,6 +23,8 @@ struct Cli {
 enum Command {
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
+    /// Compares a measured tube with its part: deviations and verdict.
+    Inspect(inspect::Args),
     /// Converts bending tables between LRA, XYZ and YBC.
     Convert(convert::Args),
 }
@@ -42,6 +45,7 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
         Command::Convert(args) => convert::run(&args),
     };
     match result {
