@@ -3,6 +3,8 @@
 //! Exit status: 0 done, 1 the tube or the machine said no, 2 the input or the arguments are unusable. Errors go
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
+mod convert;
+mod inspect;
 mod reconstruct;
 
 use std::process::ExitCode;
@@ -21,6 +23,10 @@ struct Cli {
 enum Command {
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
+    /// Compares a measured tube with its part: deviations and verdict.
+    Inspect(inspect::Args),
+    /// Converts bending tables between LRA, XYZ and YBC.
+    Convert(convert::Args),
 }
 
 /// How a subcommand ended; errors (unusable input, exit 2) travel as `anyhow::Error`.
@@ -39,6 +45,8 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Convert(args) => convert::run(&args),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

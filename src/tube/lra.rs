@@ -119,7 +119,8 @@ impl Lra {
                 "0 up to, not including, 360",
             )?;
             let radius_ok = bend.radius_mm > 0.0 && bend.radius_mm <= 100_000.0;
-            check(radius_ok || bend.angle_rad == 0.0, row, "radius_mm", bend.radius_mm, "above 0 to 100000")?;
+            let unused = bend.angle_rad == 0.0 && bend.radius_mm == 0.0;
+            check(radius_ok || unused, row, "radius_mm", bend.radius_mm, "above 0 to 100000")?;
         }
         let last = self.last_length_mm;
         check(length_ok(last), self.bends.len() + 1, "length_mm", last, "0 to 100000")

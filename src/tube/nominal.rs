@@ -1,9 +1,12 @@
 //! The part as drawn: nominal LRA, tube, die, tolerance. Read from part files by `config`.
 
+use serde::Serialize;
+
 use super::{Lra, Material};
 
 /// The named way in which measured and nominal are laid over each other before points are compared.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Alignment {
     /// Least squares over all tangent points and middles.
     #[default]

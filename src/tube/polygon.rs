@@ -51,7 +51,8 @@ impl ControlPolygon {
         Ok(ControlPolygon { corners })
     }
 
-    /// The LRA table, and the pose that puts the tube where the polygon is. Straight corners are merged.
+    /// The LRA table, and the pose that puts the tube where the polygon is. Straight corners are merged; fails
+    /// for folds, overlaps, and values that are no numbers or out of range.
     pub fn to_lra(&self) -> Result<(Lra, Frame), TubeError> {
         let corners = self.without_straight_corners()?;
         let legs: Vec<Vector3<f64>> = corners.windows(2).map(|w| w[1].point - w[0].point).collect();
@@ -69,7 +70,9 @@ impl ControlPolygon {
             if distance_mm - needed_mm < -ROUNDING_MM {
                 return Err(TubeError::Overlap { from: leg + 1, to: leg + 2, needed_mm, distance_mm });
             }
-            Ok((distance_mm - needed_mm).max(0.0))
+            // Rounding of a published table may leave a straight a hair below 0; a NaN stays one.
+            let rest_mm = distance_mm - needed_mm;
+            Ok(if rest_mm < 0.0 { 0.0 } else { rest_mm })
         };
         let mut lra = Lra::default();
         for (i, &angle_rad) in angles.iter().enumerate() {
@@ -83,6 +86,7 @@ impl ControlPolygon {
             lra.bends.push(Bend { length_mm: straight(i)?, rotation_rad, angle_rad, radius_mm });
         }
         lra.last_length_mm = straight(legs.len() - 1)?;
+        lra.validate()?;
         let x = directions[0];
         let z = normals.first().copied().unwrap_or_else(|| any_normal(&x));
         let axes = Rotation3::from_basis_unchecked(&[x, z.cross(&x), z]);
@@ -93,7 +97,9 @@ impl ControlPolygon {
     fn without_straight_corners(&self) -> Result<Vec<Corner>, TubeError> {
         let mut kept: Vec<Corner> = Vec::new();
         for corner in &self.corners {
-            if kept.last().is_none_or(|last| (corner.point - last.point).norm() > 1e-9) {
+            // Written so that a NaN is kept, for `validate` to refuse, and not dropped as a double.
+            let double = kept.last().is_some_and(|last| (corner.point - last.point).norm() <= 1e-9);
+            if !double {
                 kept.push(*corner);
             }
         }
@@ -108,7 +114,7 @@ impl ControlPolygon {
             if turn > std::f64::consts::PI - 1e-9 {
                 return Err(TubeError::Fold { corner: i + 1 });
             }
-            if turn > STRAIGHT_RAD {
+            if turn.is_nan() || turn > STRAIGHT_RAD {
                 out.push(kept[i]);
             }
         }

@@ -145,7 +145,8 @@ impl Spine {
         self.segments.last().map_or(0.0, |s| s.start_mm + s.length_mm)
     }
 
-    /// Pose at an arc length; clamped to the spine.
+    /// Pose at an arc length; clamped to the spine. At a joint it is that of the segment which ends there, so
+    /// before the turn of the next plane.
     pub fn frame_at(&self, arc_length_mm: f64) -> Frame {
         let at = arc_length_mm.clamp(0.0, self.length_mm());
         let index = self.segments.partition_point(|s| s.start_mm + s.length_mm < at);

@@ -1,0 +1,253 @@
+//! Levenberg-Marquardt on the signed distance to the tube's surface (paper 000, section 6), with robust weights,
+//! bounds and covariance, on the moment form of `moments`.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::model::{Parameter, TubeModel};
+use super::moments::{Pass, Sample};
+
+/// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
+const CUTOFF_SIGMAS: f64 = 6.0;
+
+/// Median of |x| to standard deviation for normal errors.
+const MEDIAN_TO_SIGMA: f64 = 1.4826;
+
+/// Why the solver stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stop {
+    /// The step became smaller than the data resolves.
+    Converged,
+    /// No step improved the cost.
+    Stalled,
+    /// The given number of iterations was used up.
+    Iterations,
+}
+
+/// A fitted tube.
+#[derive(Debug, Clone)]
+pub struct Fit {
+    /// The fitted model.
+    pub model: TubeModel,
+    /// Its free values.
+    pub parameters: Vec<Parameter>,
+    /// Inverse of the normal matrix times the residual variance, in the order of `parameters`.
+    pub covariance: DMatrix<f64>,
+    /// Robust standard deviation of the residuals.
+    pub sigma_mm: f64,
+    /// Robust cost at cut-off `cutoff_mm`.
+    pub cost: f64,
+    /// Residuals beyond this do not count.
+    pub cutoff_mm: f64,
+    /// Points that count.
+    pub used: usize,
+    /// Passes over the points.
+    pub passes: usize,
+    /// Why it stopped.
+    pub stop: Stop,
+}
+
+/// How far to go.
+#[derive(Debug, Clone, Copy)]
+pub struct Effort {
+    /// First cut-off of the residuals.
+    pub cutoff_mm: f64,
+    /// Rounds in which the cut-off follows the residuals' own scale; 0 keeps it.
+    pub rounds: usize,
+    /// Steps per round.
+    pub steps: usize,
+    /// What bend radii are expected, for bends too shallow to know their own.
+    pub prior: Option<RadiusPrior>,
+}
+
+/// A weak expectation of the bend radii. It keeps shallow bends from running away and counts as nothing in the
+/// covariance: a radius that the data does not carry stays unknown.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RadiusPrior {
+    /// Expected CLR.
+    pub radius_mm: f64,
+    /// Its standard deviation.
+    pub spread_mm: f64,
+}
+
+/// Fits the model to the sample. The cut-off shrinks from `effort.cutoff_mm` to six standard deviations.
+pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
+    let parameters = start.parameters();
+    let mut cutoff = effort.cutoff_mm;
+    let mut passes = 0;
+    let mut state = descend(sample, start.clone(), &parameters, cutoff, &effort);
+    passes += state.passes;
+    for _ in 0..effort.rounds {
+        let sigma = robust_sigma(&sample.residuals(&state.model), cutoff);
+        let next = (CUTOFF_SIGMAS * sigma).min(cutoff);
+        if next > 0.95 * cutoff {
+            break;
+        }
+        cutoff = next;
+        state = descend(sample, state.model, &parameters, cutoff, &effort);
+        passes += state.passes;
+    }
+    let sigma_mm = robust_sigma(&sample.residuals(&state.model), cutoff);
+    let (normal, _) = state.pass.normal_equations(&state.model.motions(&parameters), &parameters);
+    let covariance = invert(&normal) * state.pass.variance_mm2(parameters.len());
+    Fit {
+        cost: state.pass.cost,
+        used: state.pass.used,
+        model: state.model,
+        stop: state.stop,
+        parameters,
+        covariance,
+        sigma_mm,
+        cutoff_mm: cutoff,
+        passes,
+    }
+}
+
+/// Standard deviation of the residuals within the cut-off from the median of their size.
+fn robust_sigma(residuals: &[f64], cutoff_mm: f64) -> f64 {
+    let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).filter(|r| *r < cutoff_mm).collect();
+    if sizes.is_empty() {
+        return cutoff_mm;
+    }
+    let middle = sizes.len() / 2;
+    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
+    (*median * MEDIAN_TO_SIGMA).max(1e-6)
+}
+
+struct Descent {
+    model: TubeModel,
+    pass: Pass,
+    passes: usize,
+    stop: Stop,
+}
+
+fn descend(
+    sample: &mut Sample,
+    start: TubeModel,
+    parameters: &[Parameter],
+    cutoff: f64,
+    effort: &Effort,
+) -> Descent {
+    let noise = cutoff / CUTOFF_SIGMAS;
+    let total =
+        |model: &TubeModel, pass: &Pass| pass.cost + effort.prior.map_or(0.0, |p| p.cost(model, noise));
+    let mut model = start;
+    let mut pass = sample.pass(&model, cutoff);
+    let mut cost = total(&model, &pass);
+    let (mut passes, mut damping) = (1, 1e-4);
+    for _ in 0..effort.steps {
+        let (mut normal, mut gradient) = pass.normal_equations(&model.motions(parameters), parameters);
+        if let Some(prior) = &effort.prior {
+            prior.add_to(&model, parameters, noise, &mut normal, &mut gradient);
+        }
+        freeze_at_bounds(&model, parameters, &mut normal, &mut gradient);
+        let mut improved = false;
+        while damping < 1e8 {
+            let Some(step) = damped_step(&normal, &gradient, damping) else {
+                damping *= 10.0;
+                continue;
+            };
+            // Predicted gain far below the noise of the cost itself: nothing left to win.
+            if 0.5 * -gradient.dot(&step) < 1e-9 * cost.max(1e-12) {
+                return Descent { model, pass, passes, stop: Stop::Converged };
+            }
+            let next = model.stepped(parameters, &step);
+            let next_pass = sample.pass(&next, cutoff);
+            let next_cost = total(&next, &next_pass);
+            passes += 1;
+            if next_cost < cost {
+                let gain = (cost - next_cost) / cost;
+                (model, pass, cost) = (next, next_pass, next_cost);
+                damping = (damping * 0.1).max(1e-9);
+                if gain < 1e-7 {
+                    return Descent { model, pass, passes, stop: Stop::Converged };
+                }
+                improved = true;
+                break;
+            }
+            damping *= 10.0;
+        }
+        if !improved {
+            return Descent { model, pass, passes, stop: Stop::Stalled };
+        }
+    }
+    Descent { model, pass, passes, stop: Stop::Iterations }
+}
+
+impl RadiusPrior {
+    fn cost(&self, model: &TubeModel, noise_mm: f64) -> f64 {
+        let off = |radius: f64| (radius - self.radius_mm) / self.spread_mm * noise_mm;
+        model.lra.bends.iter().map(|b| 0.5 * off(b.radius_mm).powi(2)).sum()
+    }
+
+    fn add_to(
+        &self,
+        model: &TubeModel,
+        parameters: &[Parameter],
+        noise_mm: f64,
+        normal: &mut DMatrix<f64>,
+        gradient: &mut DVector<f64>,
+    ) {
+        let weight = (noise_mm / self.spread_mm).powi(2);
+        for (j, parameter) in parameters.iter().enumerate() {
+            if let Parameter::BendRadius(i) = *parameter {
+                normal[(j, j)] += weight;
+                gradient[j] += weight * (model.lra.bends[i].radius_mm - self.radius_mm);
+            }
+        }
+    }
+}
+
+/// Takes parameters that stand at a bound and would cross it out of the step.
+fn freeze_at_bounds(
+    model: &TubeModel,
+    parameters: &[Parameter],
+    normal: &mut DMatrix<f64>,
+    gradient: &mut DVector<f64>,
+) {
+    for (j, parameter) in parameters.iter().enumerate() {
+        let at_bound = match *parameter {
+            Parameter::Length(i) => model.lra.bends[i].length_mm <= 0.0,
+            Parameter::Angle(i) => model.lra.bends[i].angle_rad <= 0.0,
+            Parameter::BendRadius(i) => model.lra.bends[i].radius_mm <= model.tube_radius_mm,
+            _ => false,
+        };
+        // A positive gradient pulls the value down.
+        if at_bound && gradient[j] > 0.0 {
+            let diagonal = normal[(j, j)].max(1e-300);
+            normal.row_mut(j).fill(0.0);
+            normal.column_mut(j).fill(0.0);
+            normal[(j, j)] = diagonal;
+            gradient[j] = 0.0;
+        }
+    }
+}
+
+/// Marquardt's step: damping in proportion to each parameter's own curvature.
+fn damped_step(normal: &DMatrix<f64>, gradient: &DVector<f64>, damping: f64) -> Option<DVector<f64>> {
+    let (scaled, scale) = unit_diagonal(normal);
+    let damped = scaled + DMatrix::identity(scale.len(), scale.len()) * damping;
+    let right = -gradient.component_mul(&scale);
+    Some(damped.cholesky()?.solve(&right).component_mul(&scale))
+}
+
+/// The matrix scaled to a unit diagonal, and the scale: units of millimetres and radians drop out.
+fn unit_diagonal(matrix: &DMatrix<f64>) -> (DMatrix<f64>, DVector<f64>) {
+    let largest = matrix.diagonal().max().max(1e-300);
+    let scale = matrix.diagonal().map(|d| 1.0 / d.max(1e-14 * largest).sqrt());
+    let scaled = DMatrix::from_fn(scale.len(), scale.len(), |i, j| matrix[(i, j)] * scale[i] * scale[j]);
+    (scaled, scale)
+}
+
+/// Inverse of a normal matrix; directions that the data does not see get a huge, finite variance.
+fn invert(matrix: &DMatrix<f64>) -> DMatrix<f64> {
+    let (mut scaled, scale) = unit_diagonal(matrix);
+    let n = scale.len();
+    for exponent in -15..0 {
+        if let Some(cholesky) = scaled.clone().cholesky() {
+            let inverse = cholesky.inverse();
+            return DMatrix::from_fn(n, n, |i, j| inverse[(i, j)] * scale[i] * scale[j]);
+        }
+        scaled += DMatrix::identity(n, n) * 10f64.powi(exponent);
+    }
+    DMatrix::from_diagonal(&scale.map(|s| s * s * 1e12))
+}

@@ -1,0 +1,191 @@
+//! The tube as a parameter vector: pose, LRA rows, bend radii and the tube's radius, and how a small change
+//! of each moves the tube (its twist), which is all that the least-squares fit needs.
+//!
+//! Representation after paper 000, section 5.3. The first straight's length shares its gauge with the pose and
+//! is therefore no parameter; nor is the last one's, which the surface does not know (see `ends`).
+
+use nalgebra::{DVector, Matrix6xX, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
+
+use crate::tube::{Frame, Lra, SegmentKind, Spine, wrap_angle};
+
+/// A tube in space.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TubeModel {
+    /// Pose at the start of the first straight.
+    pub start: Frame,
+    /// Straights, rotations, angles, radii. The first row's rotation is 0: the pose holds it.
+    pub lra: Lra,
+    /// Outer radius of the tube.
+    pub tube_radius_mm: f64,
+    /// One radius for all bends (one die) instead of one each.
+    pub common_radius: bool,
+}
+
+/// One free value of the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Parameter {
+    /// Shift (0, 1, 2) or turn (3, 4, 5) of the whole along or about the start frame's axes.
+    Pose(usize),
+    /// Straight before bend i, i >= 1.
+    Length(usize),
+    /// Rotation of bend i, i >= 1.
+    Rotation(usize),
+    /// Angle of bend i.
+    Angle(usize),
+    /// CLR of bend i.
+    BendRadius(usize),
+    /// CLR of all bends.
+    CommonRadius,
+    /// Outer radius of the tube.
+    TubeRadius,
+}
+
+/// How a segment moves with the parameters: everything rigid as twists in the segment's own frame.
+#[derive(Debug, Clone)]
+pub struct SegmentMotion {
+    /// Column j: velocity and angular velocity of the segment when parameter j grows by one.
+    pub twists: Matrix6xX<f64>,
+    /// Parameter of the segment's own CLR, for arcs.
+    pub own_radius: Option<usize>,
+}
+
+impl TubeModel {
+    /// The free values in their order.
+    pub fn parameters(&self) -> Vec<Parameter> {
+        let n = self.lra.bends.len();
+        // A straight tube knows neither where along its axis nor how turned about it it is.
+        let pose = (0..6).filter(|k| n > 0 || (*k != 0 && *k != 3)).map(Parameter::Pose);
+        let mut all: Vec<Parameter> = pose.collect();
+        for i in 0..n {
+            if i > 0 {
+                all.extend([Parameter::Length(i), Parameter::Rotation(i)]);
+            }
+            all.push(Parameter::Angle(i));
+            if !self.common_radius {
+                all.push(Parameter::BendRadius(i));
+            }
+        }
+        if self.common_radius && n > 0 {
+            all.push(Parameter::CommonRadius);
+        }
+        all.push(Parameter::TubeRadius);
+        all
+    }
+
+    /// The centre line.
+    pub fn spine(&self) -> Spine {
+        Spine::from_lra(&self.lra, self.start)
+    }
+
+    /// Twists of every segment, in the order of the spine's segments (line, arc, ..., line).
+    pub fn motions(&self, parameters: &[Parameter]) -> Vec<SegmentMotion> {
+        // In the start frame: its axes carry the pose parameters.
+        let spine = Spine::from_lra(&self.lra, Frame::identity());
+        let columns: Vec<Vec<(usize, Vector6<f64>)>> =
+            parameters.iter().map(|p| sources(p, &spine)).collect();
+        let segments = spine.segments().iter().enumerate();
+        segments
+            .map(|(k, segment)| {
+                let mut twists = Matrix6xX::zeros(parameters.len());
+                for (j, sources) in columns.iter().enumerate() {
+                    let twist: Vector6<f64> =
+                        sources.iter().filter(|(from, _)| *from <= k).map(|(_, t)| t).sum();
+                    twists.set_column(j, &in_frame(&twist, &segment.start));
+                }
+                let own = |p: &Parameter| match p {
+                    Parameter::BendRadius(i) => k == 2 * i + 1,
+                    Parameter::CommonRadius => k % 2 == 1,
+                    _ => false,
+                };
+                SegmentMotion { twists, own_radius: parameters.iter().position(own) }
+            })
+            .collect()
+    }
+
+    /// The model after a step, brought back into what a tube can be (lengths >= 0, angles 0 to 355 degrees, bend
+    /// radius no smaller than the tube's).
+    pub fn stepped(&self, parameters: &[Parameter], step: &DVector<f64>) -> TubeModel {
+        let mut out = self.moved(parameters, step);
+        out.tube_radius_mm = out.tube_radius_mm.clamp(0.5 * self.tube_radius_mm, 2.0 * self.tube_radius_mm);
+        for b in &mut out.lra.bends {
+            b.length_mm = b.length_mm.max(0.0);
+            b.rotation_rad = wrap_angle(b.rotation_rad);
+            b.angle_rad = b.angle_rad.clamp(0.0, 355.0_f64.to_radians());
+            b.radius_mm = b.radius_mm.clamp(out.tube_radius_mm, 1e5);
+        }
+        out
+    }
+
+    /// The model after a step, wherever that leads.
+    pub fn moved(&self, parameters: &[Parameter], step: &DVector<f64>) -> TubeModel {
+        let mut out = self.clone();
+        let mut pose = Vector6::zeros();
+        for (p, &d) in parameters.iter().zip(step.iter()) {
+            match *p {
+                Parameter::Pose(k) => pose[k] = d,
+                Parameter::Length(i) => out.lra.bends[i].length_mm += d,
+                Parameter::Rotation(i) => out.lra.bends[i].rotation_rad += d,
+                Parameter::Angle(i) => out.lra.bends[i].angle_rad += d,
+                Parameter::BendRadius(i) => out.lra.bends[i].radius_mm += d,
+                Parameter::CommonRadius => out.lra.bends.iter_mut().for_each(|b| b.radius_mm += d),
+                Parameter::TubeRadius => out.tube_radius_mm += d,
+            }
+        }
+        let shift = Translation3::new(pose[0], pose[1], pose[2]);
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::new(pose[3], pose[4], pose[5]));
+        out.start = self.start * Frame::from_parts(shift, turn);
+        out.start.rotation.renormalize();
+        out
+    }
+}
+
+/// Which segments (from the given index on) a parameter moves, and by which twist in the start frame.
+fn sources(parameter: &Parameter, spine: &Spine) -> Vec<(usize, Vector6<f64>)> {
+    let segments = spine.segments();
+    let turn = |axis: Vector3<f64>, through: Point3<f64>| join(through.coords.cross(&axis), axis);
+    match *parameter {
+        Parameter::Pose(k) => {
+            let mut twist = Vector6::zeros();
+            twist[k] = 1.0;
+            vec![(0, twist)]
+        }
+        Parameter::Length(i) => {
+            let tangent = segments[2 * i].start.rotation * Vector3::x();
+            vec![(2 * i + 1, join(tangent, Vector3::zeros()))]
+        }
+        Parameter::Rotation(i) => {
+            let line = &segments[2 * i];
+            vec![(2 * i, turn(line.start.rotation * Vector3::x(), line.start.translation.vector.into()))]
+        }
+        Parameter::Angle(i) => {
+            let arc = &segments[2 * i + 1];
+            let centre = arc.centre().unwrap_or_else(|| arc.start.translation.vector.into());
+            vec![(2 * i + 2, turn(arc.start.rotation * Vector3::z(), centre))]
+        }
+        Parameter::BendRadius(i) => vec![end_shift(spine, i)],
+        Parameter::CommonRadius => (0..segments.len() / 2).map(|i| end_shift(spine, i)).collect(),
+        Parameter::TubeRadius => Vec::new(),
+    }
+}
+
+/// Shift of all that follows bend `i` when its CLR grows by one at fixed start and angle.
+fn end_shift(spine: &Spine, i: usize) -> (usize, Vector6<f64>) {
+    let arc = &spine.segments()[2 * i + 1];
+    let angle = match arc.kind {
+        SegmentKind::Arc { angle_rad, .. } => angle_rad,
+        SegmentKind::Line => 0.0,
+    };
+    let shift = arc.start.rotation * Vector3::new(angle.sin(), 1.0 - angle.cos(), 0.0);
+    (2 * i + 2, join(shift, Vector3::zeros()))
+}
+
+fn join(velocity: Vector3<f64>, angular: Vector3<f64>) -> Vector6<f64> {
+    Vector6::new(velocity.x, velocity.y, velocity.z, angular.x, angular.y, angular.z)
+}
+
+/// The same twist seen from `frame`.
+fn in_frame(twist: &Vector6<f64>, frame: &Frame) -> Vector6<f64> {
+    let (velocity, angular) = (twist.fixed_rows::<3>(0).into_owned(), twist.fixed_rows::<3>(3).into_owned());
+    let at_origin = velocity + angular.cross(&frame.translation.vector);
+    join(frame.rotation.inverse() * at_origin, frame.rotation.inverse() * angular)
+}
