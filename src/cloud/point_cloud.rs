@@ -17,7 +17,11 @@ pub struct PointCloud {
 impl PointCloud {
     /// A cloud without normals; the first point becomes the origin.
     pub fn from_points(points: &[Point3<f64>]) -> PointCloud {
-        let origin = points.first().copied().unwrap_or_default();
+        PointCloud::around(points.first().copied().unwrap_or_default(), points)
+    }
+
+    /// A cloud without normals about a given origin.
+    pub(super) fn around(origin: Point3<f64>, points: &[Point3<f64>]) -> PointCloud {
         let offsets = points.iter().map(|p| (p - origin).map(|v| v as f32).into()).collect();
         PointCloud { origin, offsets, normals: None }
     }
@@ -90,7 +94,7 @@ mod tests {
     #[test]
     fn a_tenth_of_a_micrometre_at_two_metres_from_a_far_origin() {
         let base = Point3::new(1.0e6, -2.0e6, 5.0e5);
-        let points = [base, base + Vector3::new(2000.0, 0.123_45, -1999.999_9)];
+        let points = [base, base + Vector3::new(2000.0, 0.123_45, -1_999.999_9)];
         let cloud = PointCloud::from_points(&points);
         assert_eq!(cloud.point(0), base);
         assert!((cloud.point(1) - points[1]).norm() < 1e-4);

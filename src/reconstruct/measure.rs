@@ -1,6 +1,6 @@
 //! From the fit to measured values: ends, sigmas from the full covariance, unknown where the data is silent.
 
-use nalgebra::{DMatrix, Point3, Vector3};
+use nalgebra::{DMatrix, DVector, Point3, Vector3};
 
 use super::ends::{self, End};
 use super::fit::Fit;
@@ -29,7 +29,7 @@ struct Values {
     angles: Vec<f64>,
     radii: Vec<f64>,
     corners: Vec<f64>,
-    tube_radius: f64,
+    tube_radius: Vec<f64>,
 }
 
 /// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values.
@@ -38,90 +38,118 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
     let at = values(&fit.model, &ends);
     let jacobian = jacobian(&fit.model, &fit.parameters, &ends);
     let covariance = &jacobian * &fit.covariance * jacobian.transpose();
-    let sigma = |row: usize| covariance[(row, row)].max(0.0).sqrt();
+    let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
+    let mut report = Report { sigma: at.like(sigmas), at, ends, warnings: Vec::new() };
     let n = fit.model.lra.bends.len();
-    let mut warnings = Vec::new();
-    let end_sigma = |i: usize| match i {
-        0 => ends.first.map(|(_, s)| s),
-        i if i == n => ends.last.map(|(_, s)| s),
-        _ => Some(0.0),
-    };
-    // A straight tube has both ends in one length.
-    let length = |i: usize, row: usize| {
-        let ends_sigma = if n == 0 { end_sigma(0)?.hypot(ends.last?.1) } else { end_sigma(i)? };
-        Some(sigma(row).hypot(ends_sigma))
-    };
-    let known_length = |value: f64, sigma: Option<f64>, what: String, warnings: &mut Vec<String>| match sigma
-    {
-        Some(s) if s <= MAX_LENGTH_SIGMA_MM => (Some(value), Some(s)),
-        Some(s) => {
-            warnings.push(format!("{what} is not known: its sigma would be {s:.1} mm"));
-            (None, None)
-        }
-        None => {
-            warnings.push(format!("{what} is not known: that end of the tube was not scanned"));
-            (None, None)
-        }
-    };
-    let mut bends = Vec::new();
-    for i in 0..n {
-        let what = format!("length before bend {}", i + 1);
-        let (length_mm, length_sigma_mm) = known_length(at.lengths[i], length(i, i), what, &mut warnings);
-        let rotation_sigma = if i == 0 { 0.0 } else { sigma(n + 1 + i) };
-        let rotation_known = rotation_sigma <= MAX_ROTATION_SIGMA_RAD;
-        if !rotation_known {
-            let deg = rotation_sigma.to_degrees();
-            warnings
-                .push(format!("rotation of bend {} is not known: its sigma would be {deg:.0} deg", i + 1));
-        }
-        let radius_sigma = sigma(3 * n + 1 + i);
-        let radius_known = radius_sigma <= MAX_RADIUS_SIGMA_SHARE * at.radii[i];
-        if !radius_known {
-            let (r, s) = (at.radii[i], radius_sigma);
-            warnings.push(format!(
-                "CLR of bend {} is not known: its sigma would be {s:.1} mm at {r:.1} mm",
-                i + 1
-            ));
-        }
-        bends.push(MeasuredBend {
-            length_mm,
-            length_sigma_mm,
-            rotation_rad: rotation_known.then_some(at.rotations[i]),
-            rotation_sigma_rad: rotation_known.then_some(rotation_sigma),
-            angle_rad: at.angles[i],
-            angle_sigma_rad: sigma(2 * n + 1 + i),
-            radius_mm: radius_known.then_some(at.radii[i]),
-            radius_sigma_mm: radius_known.then_some(radius_sigma),
-        });
-    }
-    let what = "length after the last bend".to_owned();
-    let (last_length_mm, last_length_sigma_mm) =
-        known_length(at.lengths[n], length(n, n), what, &mut warnings);
-    let corners: Vec<Option<(f64, f64)>> = (0..=n)
-        .map(|i| {
-            let away =
-                |k: usize| at.angles.get(k).is_some_and(|a| *a >= MeasuredTube::INTERSECTION_LIMIT_RAD);
-            if away(i) || (i > 0 && away(i - 1)) {
-                return None;
-            }
-            let s = length(i, 4 * n + 1 + i)?;
-            (s <= MAX_LENGTH_SIGMA_MM).then_some((at.corners[i], s))
-        })
-        .collect();
+    let bends = (0..n).map(|i| report.bend(i)).collect();
+    let last = report.length(n);
+    let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
     MeasuredTube {
-        tube_radius_mm: at.tube_radius,
+        tube_radius_mm: report.at.tube_radius[0],
         points_total: sample.points.len(),
         points_used: fit.used,
         residual_median_mm: 0.0,
         elapsed_ms: 0.0,
         scan_sha256: String::new(),
-        last_length_mm,
-        last_length_sigma_mm,
+        last_length_mm: last.map(|l| l.0),
+        last_length_sigma_mm: last.map(|l| l.1),
         bends,
         intersection_mm: corners.iter().map(|c| c.map(|c| c.0)).collect(),
         intersection_sigma_mm: corners.iter().map(|c| c.map(|c| c.1)).collect(),
         reversed: None,
-        warnings,
+        warnings: report.warnings,
+    }
+}
+
+/// Values and their sigmas on the way to the measured tube; collects what is not known.
+struct Report {
+    at: Values,
+    sigma: Values,
+    ends: Ends,
+    warnings: Vec<String>,
+}
+
+impl Report {
+    fn bend(&mut self, i: usize) -> MeasuredBend {
+        let length = self.length(i);
+        let rotation = self.rotation(i);
+        let radius = self.radius(i);
+        MeasuredBend {
+            length_mm: length.map(|l| l.0),
+            length_sigma_mm: length.map(|l| l.1),
+            rotation_rad: rotation.map(|r| r.0),
+            rotation_sigma_rad: rotation.map(|r| r.1),
+            angle_rad: self.at.angles[i],
+            angle_sigma_rad: self.sigma.angles[i],
+            radius_mm: radius.map(|r| r.0),
+            radius_sigma_mm: radius.map(|r| r.1),
+        }
+    }
+
+    /// Sigma of where leg `i` ends outside the tube; None when such an end was not scanned.
+    fn end_sigma(&self, i: usize) -> Option<f64> {
+        let last = self.at.lengths.len() - 1;
+        let first_sigma = if i == 0 { self.ends.first?.1 } else { 0.0 };
+        let last_sigma = if i == last { self.ends.last?.1 } else { 0.0 };
+        Some(first_sigma.hypot(last_sigma))
+    }
+
+    /// Straight `i` with its sigma.
+    fn length(&mut self, i: usize) -> Option<(f64, f64)> {
+        let what = if i + 1 == self.at.lengths.len() {
+            "the length after the last bend".to_owned()
+        } else {
+            format!("the length before bend {}", i + 1)
+        };
+        let Some(end) = self.end_sigma(i) else {
+            self.warnings.push(format!("{what} is not known: that end of the tube was not scanned"));
+            return None;
+        };
+        let sigma = self.sigma.lengths[i].hypot(end);
+        if sigma > MAX_LENGTH_SIGMA_MM {
+            self.warnings.push(format!("{what} is not known: its sigma would be {sigma:.1} mm"));
+            return None;
+        }
+        Some((self.at.lengths[i], sigma))
+    }
+
+    fn rotation(&mut self, i: usize) -> Option<(f64, f64)> {
+        if i == 0 {
+            return Some((0.0, 0.0));
+        }
+        let sigma = self.sigma.rotations[i];
+        if sigma > MAX_ROTATION_SIGMA_RAD {
+            let deg = sigma.to_degrees();
+            self.warnings.push(format!(
+                "the rotation of bend {} is not known: its sigma would be {deg:.0} degrees",
+                i + 1
+            ));
+            return None;
+        }
+        Some((self.at.rotations[i], sigma))
+    }
+
+    fn radius(&mut self, i: usize) -> Option<(f64, f64)> {
+        let (radius, sigma) = (self.at.radii[i], self.sigma.radii[i]);
+        if sigma > MAX_RADIUS_SIGMA_SHARE * radius {
+            self.warnings.push(format!(
+                "the CLR of bend {} is not known: its sigma would be {sigma:.1} mm at {radius:.1} mm",
+                i + 1
+            ));
+            return None;
+        }
+        Some((radius, sigma))
+    }
+
+    /// Distance from the corner before leg `i` to the one after it; None beside a bend whose corner runs away.
+    fn corner(&self, i: usize) -> Option<(f64, f64)> {
+        let away =
+            |k: usize| self.at.angles.get(k).is_some_and(|a| *a >= MeasuredTube::INTERSECTION_LIMIT_RAD);
+        if away(i) || (i > 0 && away(i - 1)) {
+            return None;
+        }
+        let sigma = self.sigma.corners[i].hypot(self.end_sigma(i)?);
+        (sigma <= MAX_LENGTH_SIGMA_MM).then_some((self.at.corners[i], sigma))
     }
 }
 
@@ -183,7 +211,7 @@ fn values(model: &TubeModel, ends: &Ends) -> Values {
         rotations: model.lra.bends.iter().map(|b| b.rotation_rad).collect(),
         angles: model.lra.bends.iter().map(|b| b.angle_rad).collect(),
         radii: model.lra.bends.iter().map(|b| b.radius_mm).collect(),
-        tube_radius: model.tube_radius_mm,
+        tube_radius: vec![model.tube_radius_mm],
         lengths,
     }
 }
@@ -196,31 +224,38 @@ fn along(spine: &Spine, index: usize, end: &Point3<f64>, sign: f64) -> f64 {
 
 impl Values {
     fn flat(&self) -> Vec<f64> {
-        let parts = [&self.lengths, &self.rotations, &self.angles, &self.radii, &self.corners];
-        parts.into_iter().flatten().copied().chain([self.tube_radius]).collect()
+        let parts =
+            [&self.lengths, &self.rotations, &self.angles, &self.radii, &self.corners, &self.tube_radius];
+        parts.into_iter().flatten().copied().collect()
+    }
+
+    /// Other numbers in the same order as [`Values::flat`].
+    fn like(&self, flat: Vec<f64>) -> Values {
+        let mut rest = flat.into_iter();
+        let mut take = |like: &[f64]| rest.by_ref().take(like.len()).collect();
+        Values {
+            lengths: take(&self.lengths),
+            rotations: take(&self.rotations),
+            angles: take(&self.angles),
+            radii: take(&self.radii),
+            corners: take(&self.corners),
+            tube_radius: take(&self.tube_radius),
+        }
     }
 }
 
 /// Derivatives of all values by all parameters (central differences of closed formulas).
 fn jacobian(model: &TubeModel, parameters: &[Parameter], ends: &Ends) -> DMatrix<f64> {
-    let rows = values(model, ends).flat().len();
-    let mut out = DMatrix::zeros(rows, parameters.len());
+    let base = values(model, ends);
+    let mut out = DMatrix::zeros(base.flat().len(), parameters.len());
     let h = 1e-6;
     for j in 0..parameters.len() {
         let at = |d: f64| {
-            let mut step = nalgebra::DVector::zeros(parameters.len());
+            let mut step = DVector::zeros(parameters.len());
             step[j] = d;
-            values(&model.moved(parameters, &step), ends).flat()
+            DVector::from_vec(values(&model.moved(parameters, &step), ends).flat())
         };
-        let (plus, minus) = (at(h), at(-h));
-        for row in 0..rows {
-            let difference = plus[row] - minus[row];
-            // Rotations wrap.
-            let n = model.lra.bends.len();
-            let wraps = (n + 1..2 * n + 1).contains(&row);
-            let difference = if wraps { crate::tube::wrap_angle(difference) } else { difference };
-            out[(row, j)] = difference / (2.0 * h);
-        }
+        out.set_column(j, &((at(h) - at(-h)) / (2.0 * h)));
     }
     out
 }

@@ -8,6 +8,7 @@ pub mod apollonius;
 pub mod arcline;
 pub mod crust;
 pub mod cylinder;
+mod direction;
 mod ends;
 mod evidence;
 pub mod fit;
@@ -23,7 +24,7 @@ use nalgebra::Point3;
 use thiserror::Error;
 
 use crate::cloud::PointCloud;
-use crate::tube::{MeasuredTube, Nominal, Spine};
+use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
 use fit::{Effort, fit};
 use moments::Sample;
 
@@ -39,6 +40,8 @@ pub struct Options<'a> {
 pub struct Reconstruction {
     /// The measured values.
     pub measured: MeasuredTube,
+    /// The fitted table, also those values that are too uncertain to be given as measured.
+    pub lra: Lra,
     /// The centre line in the scan's coordinates, end to end.
     pub spine: Spine,
     /// Signed distance of every point of the cloud from the fitted surface, in the cloud's order.
@@ -147,10 +150,11 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     let residuals_mm = all.residuals(&best.model);
     let mut used: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
-    let mut spine = best.model.spine();
-    let _ = options;
-    let _ = &mut spine;
-    Ok(Reconstruction { measured, spine, residuals_mm })
+    let found = Reconstruction { measured, spine: best.model.spine(), lra: best.model.lra, residuals_mm };
+    Ok(match options.nominal {
+        Some(nominal) => direction::as_nominal(found, &nominal.lra),
+        None => found,
+    })
 }
 
 /// The spine's polygon through the whole tube.

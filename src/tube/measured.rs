@@ -80,6 +80,36 @@ impl MeasuredTube {
     /// From this bend angle on a corner runs away and intersection distances are not given.
     pub const INTERSECTION_LIMIT_RAD: f64 = 150.0 * std::f64::consts::PI / 180.0;
 
+    /// A measurement without any error or uncertainty: for tests and for what simulators know.
+    pub fn exact(lra: &Lra, tube_radius_mm: f64) -> MeasuredTube {
+        let bend = |b: &Bend| MeasuredBend {
+            length_mm: Some(b.length_mm),
+            length_sigma_mm: Some(0.0),
+            rotation_rad: Some(b.rotation_rad),
+            rotation_sigma_rad: Some(0.0),
+            angle_rad: b.angle_rad,
+            angle_sigma_rad: 0.0,
+            radius_mm: Some(b.radius_mm),
+            radius_sigma_mm: Some(0.0),
+        };
+        let corners = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
+        MeasuredTube {
+            tube_radius_mm,
+            points_total: 0,
+            points_used: 0,
+            residual_median_mm: 0.0,
+            elapsed_ms: 0.0,
+            scan_sha256: String::new(),
+            last_length_mm: Some(lra.last_length_mm),
+            last_length_sigma_mm: Some(0.0),
+            bends: lra.bends.iter().map(bend).collect(),
+            intersection_sigma_mm: corners.iter().map(|c| c.map(|_| 0.0)).collect(),
+            intersection_mm: corners,
+            reversed: None,
+            warnings: Vec::new(),
+        }
+    }
+
     /// The measured values as a plain table; unknown lengths, rotations and radii are filled from `fallback`
     /// (row by row, when it has as many bends) or with 0. For laying the tube out, not for correcting by.
     pub fn lra_or(&self, fallback: Option<&Lra>) -> Lra {

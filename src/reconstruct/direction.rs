@@ -1,0 +1,67 @@
+//! Which way the scanned tube is travelled: the nominal's, when there is one.
+
+use nalgebra::{Point3, Vector3};
+
+use super::Reconstruction;
+use crate::tube::align::{Pair, register};
+use crate::tube::{Frame, Lra, Spine};
+
+/// Places along the tube that are compared.
+const PLACES: usize = 100;
+
+/// The reconstruction in the direction in which it lies closer to the nominal.
+pub fn as_nominal(found: Reconstruction, nominal: &Lra) -> Reconstruction {
+    let wanted = places(&Spine::from_lra(nominal, Frame::identity()));
+    let as_is = places(&found.spine);
+    let turned: Vec<Point3<f64>> = as_is.iter().rev().copied().collect();
+    let reversed = distance(&turned, &wanted) < distance(&as_is, &wanted);
+    let mut out = if reversed { turn_round(found) } else { found };
+    out.measured.reversed = Some(reversed);
+    out
+}
+
+fn places(spine: &Spine) -> Vec<Point3<f64>> {
+    (0..=PLACES).map(|k| spine.point_at(spine.length_mm() * k as f64 / PLACES as f64)).collect()
+}
+
+fn distance(from: &[Point3<f64>], to: &[Point3<f64>]) -> f64 {
+    let pairs: Vec<Pair> = from.iter().zip(to).map(|(&from, &to)| Pair { from, to, weight: 1.0 }).collect();
+    register(&pairs).map_or(f64::INFINITY, |r| r.rms_mm)
+}
+
+fn turn_round(found: Reconstruction) -> Reconstruction {
+    let end = found.spine.frame_at(found.spine.length_mm());
+    // Looking back the tangent and the plane's normal change sign.
+    let start = end * Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
+    let lra = found.lra.reversed();
+    Reconstruction { measured: found.measured.reversed(), spine: Spine::from_lra(&lra, start), lra, ..found }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tube::{Bend, MeasuredTube};
+
+    #[test]
+    fn a_tube_scanned_from_its_other_end_is_turned_round() {
+        let bend =
+            |length_mm, rotation_rad, angle_rad| Bend { length_mm, rotation_rad, angle_rad, radius_mm: 30.0 };
+        let nominal = Lra {
+            bends: vec![bend(50.0, 0.0, 1.0), bend(80.0, 1.2, 2.0), bend(20.0, -0.4, 0.5)],
+            last_length_mm: 120.0,
+        };
+        let lra = nominal.reversed();
+        let start = Frame::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, 0.2, 0.3));
+        let spine = Spine::from_lra(&lra, start);
+        let measured = MeasuredTube::exact(&lra, 10.0);
+        let found = Reconstruction { measured, spine: spine.clone(), lra, residuals_mm: Vec::new() };
+        let turned = as_nominal(found, &nominal);
+        assert_eq!(turned.measured.reversed, Some(true));
+        assert_eq!(turned.lra, nominal);
+        for k in 0..=20 {
+            let at = turned.spine.length_mm() * k as f64 / 20.0;
+            let same = spine.point_at(spine.length_mm() - at);
+            assert!((turned.spine.point_at(at) - same).norm() < 1e-9);
+        }
+    }
+}
