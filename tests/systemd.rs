@@ -67,7 +67,8 @@ fn what_the_unit_starts_ends_with_2_when_its_config_is_unusable() {
     // RestartPreventExitStatus=2 relies on it.
     let unit = std::fs::read_to_string(unit_file("benderd.service")).unwrap();
     let start = unit.lines().find_map(|l| l.strip_prefix("ExecStart=/usr/bin/benderd ")).unwrap();
-    let args: Vec<&str> = start.split(' ').map(|a| if a.starts_with('/') { "/nowhere/benderd.toml" } else { a }).collect();
+    let args: Vec<&str> =
+        start.split(' ').map(|a| if a.starts_with('/') { "/nowhere/benderd.toml" } else { a }).collect();
     let output = Command::new(env!("CARGO_BIN_EXE_benderd")).args(&args).output().unwrap();
     let text = printed(&output);
     assert_eq!(output.status.code(), Some(2), "{text}");
