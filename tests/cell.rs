@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use benderd::arm::ScanFile;
+use benderd::bender::TableId;
 use benderd::cell::{
     Action, Cell, Decision, Delivered, Dwell, Event, InForce, Purpose, State, Ticket, Verdict,
 };
@@ -26,8 +27,12 @@ fn table(last_length_mm: f64) -> CommandTable {
     CommandTable { bends: Vec::new(), last_length_mm }
 }
 
+fn id(revision: u32) -> TableId {
+    TableId { revision, crc: revision + 100 }
+}
+
 fn in_force(revision: u32) -> InForce {
-    InForce { revision, crc: revision + 100, table: table(f64::from(revision)) }
+    InForce { id: id(revision), program: "bracket".into(), table: table(f64::from(revision)) }
 }
 
 fn tube() -> Box<MeasuredTube> {
@@ -41,7 +46,7 @@ fn decision(verdict: Verdict) -> Box<Decision> {
 
 impl Bench {
     fn new(mode: Mode) -> Bench {
-        let cell = Cell::new(mode, Dwell::default());
+        let cell = Cell::new(mode, "bracket", Dwell::default());
         Bench { cell, now: Duration::ZERO, ticket: Ticket(0), log: Vec::new() }
     }
 
@@ -52,7 +57,7 @@ impl Bench {
                 Action::ReadMachine(t)
                 | Action::Measure(t, _)
                 | Action::Decide(t)
-                | Action::Deliver(t, _) => {
+                | Action::Deliver(t, ..) => {
                     self.ticket = *t;
                 }
                 _ => {}
@@ -105,14 +110,14 @@ impl Bench {
                 return Some(b);
             }
             if name.contains("Resolve") {
-                let intent = Some(in_force(2).revision());
+                let intent = Some(id(2));
                 b.on(Event::Delivered(b.ticket, Delivered::Unknown("cut".into(), intent)));
                 if name == "Reading(Resolve)" {
                     b.overdue();
                 }
                 return Some(b);
             }
-            b.on(Event::Delivered(b.ticket, Delivered::Applied(in_force(2))));
+            b.on(Event::Delivered(b.ticket, Delivered::Applied(id(2))));
         }
         if name == "Ready" {
             return Some(b);
@@ -138,6 +143,7 @@ impl Bench {
 
     fn events(&self) -> Vec<(&'static str, Event)> {
         let (t, old) = (self.ticket, Ticket(0));
+        let other = InForce { program: "flange".into(), ..in_force(2) };
         let delivered = |outcome| Event::Delivered(t, outcome);
         vec![
             ("start", Event::Start),
@@ -146,6 +152,7 @@ impl Bench {
             ("time is up", Event::Tick),
             ("machine read, same table", Event::MachineRead(t, in_force(2))),
             ("machine read, other table", Event::MachineRead(t, in_force(9))),
+            ("machine read, other program", Event::MachineRead(t, other)),
             ("machine lost", Event::MachineLost(t, "gone".into())),
             ("late machine read", Event::MachineRead(old, in_force(2))),
             ("scan", Event::Scan(scan())),
@@ -158,10 +165,11 @@ impl Bench {
             ("decided rescan", Event::Decided(t, decision(Verdict::Rescan))),
             ("decided hold", Event::Decided(t, decision(Verdict::Hold))),
             ("late decided correct", Event::Decided(old, decision(Verdict::Correct))),
-            ("delivered", delivered(Delivered::Applied(in_force(3)))),
+            ("delivered", delivered(Delivered::Applied(id(3)))),
             ("delivery rejected", delivered(Delivered::Rejected("no".into()))),
+            ("delivery not applied", delivered(Delivered::NotApplied("cut".into()))),
             ("delivery unknown", delivered(Delivered::Unknown("cut".into(), None))),
-            ("late delivered", Event::Delivered(old, Delivered::Applied(in_force(3)))),
+            ("late delivered", Event::Delivered(old, Delivered::Applied(id(3)))),
         ]
     }
 }
@@ -288,9 +296,9 @@ fn a_delivery_that_is_disarmed_ends_disarmed_but_is_not_forgotten() {
     let mut b = Bench::at(Mode::Automatic, "Delivering").unwrap();
     b.on(Event::Disarm);
     assert_eq!(name(b.cell.state()), "Delivering");
-    b.on(Event::Delivered(b.ticket, Delivered::Applied(in_force(2))));
+    b.on(Event::Delivered(b.ticket, Delivered::Applied(id(2))));
     assert_eq!(b.cell.state(), &State::Disarmed);
-    assert_eq!(b.cell.in_force().unwrap().revision, 2);
+    assert_eq!(b.cell.in_force().unwrap().id, id(2));
 }
 
 #[test]
@@ -311,7 +319,7 @@ fn an_unknown_delivery_is_resolved_by_reading_and_never_sent_again() {
     b.on(Event::Arm);
     b.read(2);
     b.decide(Verdict::FirstPiece);
-    b.on(Event::Delivered(b.ticket, Delivered::Applied(in_force(2))));
+    b.on(Event::Delivered(b.ticket, Delivered::Applied(id(2))));
     b.on(Event::Scan(scan()));
     assert!(matches!(b.read(2)[..], [Action::Measure(..)]));
 }

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::arm::ScanFile;
+use crate::bender::TableId;
 use crate::tube::{CommandTable, MeasuredTube};
 
 /// Names one piece of work asked for; its result carries the same. A result whose ticket is not the current one
@@ -13,34 +14,12 @@ pub struct Ticket(pub u64);
 /// The table that a machine holds active, as read from it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct InForce {
-    /// Its revision.
-    pub revision: u32,
-    /// CRC-32 of its encoded form.
-    pub crc: u32,
-    /// Its rows.
+    /// Which table it is.
+    pub id: TableId,
+    /// Name of the program that is loaded.
+    pub program: String,
+    /// The table's rows; none before the first delivery.
     pub table: CommandTable,
-}
-
-/// Which table a machine holds: enough to know it again.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Revision {
-    /// Counts up with every table.
-    pub number: u32,
-    /// CRC-32 of the encoded table.
-    pub crc: u32,
-}
-
-impl InForce {
-    /// Which table this is.
-    pub fn revision(&self) -> Revision {
-        Revision { number: self.revision, crc: self.crc }
-    }
-}
-
-impl std::fmt::Display for Revision {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "revision {} with CRC {:08x}", self.number, self.crc)
-    }
 }
 
 /// What the next table shall be, and why.
@@ -73,11 +52,13 @@ pub enum Verdict {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Delivered {
     /// Read back as active.
-    Applied(InForce),
+    Applied(TableId),
     /// Refused by the machine or by us; nothing changed there.
     Rejected(String),
+    /// Something failed on the way; nothing changed there.
+    NotApplied(String),
     /// The machine must be read before anything else; what it may hold by then, if a commit was sent.
-    Unknown(String, Option<Revision>),
+    Unknown(String, Option<TableId>),
 }
 
 /// Something that happened.
@@ -116,8 +97,8 @@ pub enum Action {
     Measure(Ticket, ScanFile),
     /// Decide the next step from [`Cell::history`](super::Cell::history).
     Decide(Ticket),
-    /// Deliver this table over the one in force.
-    Deliver(Ticket, CommandTable),
+    /// Deliver this table over the one in force, if that is still this one.
+    Deliver(Ticket, CommandTable, TableId),
     /// The scan was used: file it as done.
     FileDone(ScanFile),
     /// The scan was not used: file it as failed with this reason.

@@ -7,8 +7,9 @@
 
 use std::time::Duration;
 
-use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Revision, Ticket, Verdict};
+use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
 use crate::arm::ScanFile;
+use crate::bender::TableId;
 use crate::config::Mode;
 use crate::tube::{CommandTable, MeasuredTube};
 
@@ -51,7 +52,7 @@ pub enum Purpose {
     /// To see that the table in force is still ours before a part is judged by it.
     Recall(ScanFile),
     /// To learn what became of a delivery (None: it may not have come as far as the commit).
-    Resolve(Option<Revision>),
+    Resolve(Option<TableId>),
 }
 
 /// A machine that cannot be reached.
@@ -76,6 +77,8 @@ pub struct Part {
 #[derive(Debug)]
 pub struct Cell {
     mode: Mode,
+    /// Name of the part, and of its program at the machine.
+    program: String,
     dwell: Dwell,
     state: State,
     now: Duration,
@@ -87,7 +90,7 @@ pub struct Cell {
     /// The machine's table when it was last read.
     in_force: Option<InForce>,
     /// What this cell delivered last.
-    ours: Option<Revision>,
+    ours: Option<TableId>,
     history: Vec<Part>,
     /// Scans in a row that could not be used.
     unusable: u32,
@@ -96,10 +99,11 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// A cell that has not started.
-    pub fn new(mode: Mode, dwell: Dwell) -> Cell {
+    /// A cell that has not started; `program` is the part's name at the machine.
+    pub fn new(mode: Mode, program: &str, dwell: Dwell) -> Cell {
         Cell {
             mode,
+            program: program.to_owned(),
             dwell,
             state: State::Disarmed,
             now: Duration::ZERO,
@@ -176,8 +180,8 @@ impl Cell {
             (State::Deciding(scan), Event::Decided(t, decision)) if t == self.ticket => {
                 self.decided(scan, *decision)
             }
-            (State::Delivering(_), Event::Delivered(t, outcome)) if t == self.ticket => {
-                self.delivered(outcome)
+            (State::Delivering(table), Event::Delivered(t, outcome)) if t == self.ticket => {
+                self.delivered(table, outcome)
             }
             _ => Vec::new(),
         }
@@ -224,16 +228,24 @@ impl Cell {
 
     fn machine_read(&mut self, why: Purpose, read: InForce) -> Vec<Action> {
         self.attempts = 0;
-        let found = read.revision();
+        let found = read.id;
         let ours = self.ours == Some(found);
+        let other_program = (read.program != self.program).then(|| {
+            format!(
+                "the machine has program {:?} loaded, this cell's part is {:?}",
+                read.program, self.program
+            )
+        });
         self.in_force = Some(read);
-        match why {
-            Purpose::Contact => self.contacted(),
-            Purpose::Arming if ours => self.decide(None),
-            Purpose::Arming => self.begin_job(),
-            Purpose::Recall(scan) if ours || self.mode == Mode::Observe => self.measure(scan),
-            Purpose::Recall(scan) => self.changed_at_machine(scan, found),
-            Purpose::Resolve(intent) => self.resolved(intent, found),
+        match (why, other_program) {
+            (Purpose::Contact, _) => self.contacted(),
+            (Purpose::Resolve(intent), _) => self.resolved(intent, found),
+            (Purpose::Arming, Some(reason)) => self.hold(reason),
+            (Purpose::Recall(scan), Some(reason)) => self.scan_of_other_program(scan, reason),
+            (Purpose::Arming, None) if ours => self.decide(None),
+            (Purpose::Arming, None) => self.begin_job(),
+            (Purpose::Recall(scan), None) if ours || self.mode == Mode::Observe => self.measure(scan),
+            (Purpose::Recall(scan), None) => self.changed_at_machine(scan, found),
         }
     }
 
@@ -247,7 +259,7 @@ impl Cell {
 
     /// The machine's word on a delivery that was cut short: it holds the table or it does not. Either way the cell
     /// comes back disarmed.
-    fn resolved(&mut self, intent: Option<Revision>, found: Revision) -> Vec<Action> {
+    fn resolved(&mut self, intent: Option<TableId>, found: TableId) -> Vec<Action> {
         if intent == Some(found) {
             self.ours = intent;
         }
@@ -276,13 +288,22 @@ impl Cell {
         vec![Action::Measure(self.next_ticket(), scan)]
     }
 
-    fn changed_at_machine(&mut self, scan: ScanFile, found: Revision) -> Vec<Action> {
+    fn changed_at_machine(&mut self, scan: ScanFile, found: TableId) -> Vec<Action> {
         let expected = self.ours.map_or_else(|| "none".to_owned(), |r| r.to_string());
         let reason = format!(
             "the machine's table is not the one that was delivered (expected {expected}, found {found}): somebody \
              changed it there; arming again begins the job afresh"
         );
         self.enter(State::Held(reason.clone()));
+        vec![Action::FileFailed(scan, reason)]
+    }
+
+    /// Observing waits for the program to come back; a cell that writes stops for a person.
+    fn scan_of_other_program(&mut self, scan: ScanFile, reason: String) -> Vec<Action> {
+        match self.mode {
+            Mode::Observe => self.enter(State::Ready),
+            Mode::Automatic => drop(self.hold(reason.clone())),
+        }
         vec![Action::FileFailed(scan, reason)]
     }
 
@@ -366,21 +387,25 @@ impl Cell {
 
     fn go_on(&mut self, verdict: Verdict, table: CommandTable) -> Vec<Action> {
         match self.mode {
-            Mode::Automatic if verdict != Verdict::InTolerance => {
-                self.enter(State::Delivering(table.clone()));
-                return vec![Action::Deliver(self.next_ticket(), table)];
-            }
+            Mode::Automatic if verdict != Verdict::InTolerance => return self.deliver(table),
             _ if verdict == Verdict::InTolerance => self.enter(State::InTolerance),
             _ => self.enter(State::Ready),
         }
         Vec::new()
     }
 
-    fn delivered(&mut self, outcome: Delivered) -> Vec<Action> {
+    fn deliver(&mut self, table: CommandTable) -> Vec<Action> {
+        // Only a machine that was read leads here; without a table read there is none to be replaced.
+        let expected = self.in_force.as_ref().map_or(TableId::default(), |f| f.id);
+        self.enter(State::Delivering(table.clone()));
+        vec![Action::Deliver(self.next_ticket(), table, expected)]
+    }
+
+    fn delivered(&mut self, table: CommandTable, outcome: Delivered) -> Vec<Action> {
         match outcome {
-            Delivered::Applied(in_force) => {
-                self.ours = Some(in_force.revision());
-                self.in_force = Some(in_force);
+            Delivered::Applied(id) => {
+                self.ours = Some(id);
+                self.in_force = Some(InForce { id, program: self.program.clone(), table });
                 let actions = self.wait();
                 if std::mem::take(&mut self.disarm_after) {
                     self.enter(State::Disarmed);
@@ -388,6 +413,7 @@ impl Cell {
                 actions
             }
             Delivered::Rejected(reason) => self.hold(reason),
+            Delivered::NotApplied(reason) => self.fault(reason, Purpose::Contact),
             Delivered::Unknown(reason, intent) => self.fault(reason, Purpose::Resolve(intent)),
         }
     }

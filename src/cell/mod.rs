@@ -5,5 +5,5 @@
 mod event;
 mod machine;
 
-pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Revision, Ticket, Verdict};
+pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
 pub use machine::{Cell, Fault, Part, Purpose, State};
