@@ -19,6 +19,14 @@ pub enum ConfigError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// The file could not be written.
+    #[error("{file}: cannot be written: {source}")]
+    Write {
+        /// Path as given.
+        file: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
     /// Not TOML, an unknown key, a missing key or a value of the wrong type.
     #[error("{file}: {detail}")]
     Syntax {
@@ -68,6 +76,11 @@ impl Document {
     /// The name used in errors.
     pub fn file(&self) -> &str {
         &self.file
+    }
+
+    /// The text itself.
+    pub fn text(&self) -> &str {
+        &self.text
     }
 
     /// Deserialises the whole text.

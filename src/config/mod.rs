@@ -6,7 +6,9 @@
 mod document;
 mod materials;
 mod part;
+mod tables;
 
 pub use document::{ConfigError, Document};
 pub use materials::Materials;
 pub use part::{load_part, parse_part};
+pub use tables::{Table, format_table, parse_table, read_table, write_table};
