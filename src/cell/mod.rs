@@ -1,1 +1,5 @@
 //! The closed loop of one bending cell.
+
+mod intents;
+
+pub use intents::JournalledIntents;
