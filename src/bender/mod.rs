@@ -1,1 +1,34 @@
 //! The machine: profiles, links, and the stage-verify-commit handshake, the only gate to it.
+//!
+//! A table comes in from `correct` or the command line as a [`Job`]; [`deliver`] drives the pure state machine
+//! [`Delivery`] over a [`Bender`] and answers with an [`Outcome`]. On the way:
+//!
+//! ```text
+//! profile   what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
+//! limits    the gate's figures: travel, clamp lengths, row count
+//! wire      tables to bytes and back, CRC, status word by word
+//! delivery  stage, verify, commit: events and time in, one action out
+//! driver    performs the actions on a link and a journal
+//! modbus    the Modbus TCP link
+//! ```
+
+mod delivery;
+mod driver;
+mod limits;
+mod link;
+mod modbus;
+mod profile;
+mod profile_file;
+mod wire;
+
+pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
+pub use driver::{IntentLog, LogError, deliver};
+pub use limits::{Reason, check_limits};
+pub use link::{ActiveTable, Bender, LinkError};
+pub use modbus::ModbusLink;
+pub use profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
+pub use profile_file::shipped_profiles;
+pub use wire::{
+    Ack, Staged, Status, TableId, commit_image, crc_of, decode_payload, decode_status, encode_payload,
+    payload_bytes, staging_image, status_span,
+};

@@ -1,9 +1,21 @@
 //! The closed loop of one bending cell: a scan comes in, a corrected table goes out, when that may be.
 //!
-//! [`Cell`] is the pure state machine; its driver performs what it asks for.
+//! ```text
+//! event, machine   the pure state machine: what may happen when
+//! driver           performs what it asks for: scans, measuring, deciding, journal
+//! worker           the machine's side of that, one thing at a time
+//! intents          deliveries in the journal
+//! setup            benderd.toml's cell with everything it names
+//! ```
 
 mod event;
+mod intents;
+mod journalling;
 mod machine;
+mod measure;
+mod worker;
 
 pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
+pub use intents::JournalledIntents;
 pub use machine::{Cell, Fault, Part, Purpose, State};
+pub use measure::measure;

@@ -1,1 +1,4 @@
 //! Simulated tube, scan arm and bender: stand-ins for the hardware that share nothing with the estimators.
+
+pub mod bender;
+pub mod bender_server;

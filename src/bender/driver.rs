@@ -1,0 +1,63 @@
+//! Performs what [`Delivery`] asks for, on a link and a journal. The only async part of the handshake, and a
+//! thin one: no decision is taken here.
+
+use tokio::time::{Duration, Instant};
+
+use super::delivery::{Action, Delivery, Event, Intent, Job, Outcome};
+use super::link::{Bender, LinkError};
+
+/// Why the journal could not take something.
+pub type LogError = Box<dyn std::error::Error + Send + Sync>;
+
+/// Where intents and outcomes are kept. An intent must be on disk when `intent` returns.
+pub trait IntentLog: Send {
+    /// Before the commit.
+    fn intent(&mut self, intent: &Intent) -> Result<(), LogError>;
+
+    /// After it, or in its stead; `intent` is the one journalled in this delivery, if it came that far.
+    fn outcome(&mut self, job: &Job, intent: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError>;
+}
+
+/// Delivers one table. Every delivery ends, within the profile's deadlines, and leaves its outcome in the log;
+/// where the log refuses that, the intent before it stands and the next contact resolves it.
+pub async fn deliver<B: Bender>(bender: &mut B, job: &Job, log: &mut dyn IntentLog) -> Outcome {
+    let start = Instant::now();
+    let (mut delivery, mut action) = Delivery::start(bender.profile(), job);
+    let mut journalled = None;
+    loop {
+        let event = match action {
+            Action::ReadStatus => answer(bender.read_status().await, Event::StatusRead),
+            Action::WriteStaging(staged) => answer(bender.write_staging(&staged).await, |()| Event::Written),
+            Action::ReadStaging { bytes } => answer(bender.read_staging(bytes).await, Event::ReadBack),
+            Action::JournalIntent(intent) => match log.intent(&intent) {
+                Ok(()) => {
+                    tracing::info!(program = intent.program, new = %intent.new, old = %intent.old, "committing");
+                    journalled = Some(intent);
+                    Event::IntentJournalled
+                }
+                Err(error) => Event::Failed(format!("the intent could not be journalled: {error}")),
+            },
+            Action::Commit(id) => answer(bender.commit(id).await, |()| Event::Committed),
+            Action::ReadActive => answer(bender.read_active().await, Event::ActiveRead),
+            Action::Wait { until_ms } => {
+                tokio::time::sleep_until(start + Duration::from_millis(until_ms)).await;
+                Event::Timeout
+            }
+            Action::Finish(outcome) => {
+                if let Err(error) = log.outcome(job, journalled.as_ref(), &outcome) {
+                    tracing::error!(%error, ?outcome, "the outcome could not be journalled");
+                }
+                return outcome;
+            }
+        };
+        let now_ms = u64::try_from(start.elapsed().as_millis()).unwrap_or(u64::MAX);
+        action = delivery.on(event, now_ms);
+    }
+}
+
+fn answer<T>(result: Result<T, LinkError>, event: impl FnOnce(T) -> Event) -> Event {
+    match result {
+        Ok(value) => event(value),
+        Err(error) => Event::Failed(error.to_string()),
+    }
+}

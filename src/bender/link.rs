@@ -1,0 +1,99 @@
+//! What every link to a machine can do, and how it fails.
+//!
+//! A link keeps no opinion: it reads and writes what the delivery asks for, once, within its deadline. After
+//! any doubt (timeout, wrong length, wrong header) it drops the connection and says so.
+
+use std::future::Future;
+
+use thiserror::Error;
+
+use super::profile::Profile;
+use super::wire::{Staged, Status, TableId};
+
+/// Why a request did not do what was asked. Whether a write was applied is then not known.
+#[derive(Debug, Error)]
+pub enum LinkError {
+    /// No connection.
+    #[error(
+        "{endpoint}: cannot connect: {why}; check that the machine is on and its address and port are right"
+    )]
+    Connect {
+        /// Where.
+        endpoint: String,
+        /// What the system said.
+        why: String,
+    },
+    /// No reply in time.
+    #[error(
+        "{endpoint}: no answer within {ms} ms when {what}; the connection was dropped, a late answer is not used"
+    )]
+    Timeout {
+        /// Where.
+        endpoint: String,
+        /// What was asked, with the address.
+        what: String,
+        /// The deadline.
+        ms: u128,
+    },
+    /// The connection broke or the reply was no Modbus.
+    #[error("{endpoint}: the connection failed when {what}: {why}")]
+    Broken {
+        /// Where.
+        endpoint: String,
+        /// What was asked, with the address.
+        what: String,
+        /// What was seen.
+        why: String,
+    },
+    /// The machine refused the request itself.
+    #[error("{endpoint}: the machine refused {what}: {exception}")]
+    Exception {
+        /// Where.
+        endpoint: String,
+        /// What was asked, with the address.
+        what: String,
+        /// Modbus exception with its number.
+        exception: String,
+    },
+    /// An answer that cannot be right.
+    #[error("{endpoint}: {why}")]
+    Nonsense {
+        /// Where.
+        endpoint: String,
+        /// What is wrong with it.
+        why: String,
+    },
+}
+
+/// The table in force as one look at the machine shows it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ActiveTable {
+    /// Status of the same look, read first.
+    pub status: Status,
+    /// The active payload, as long as its own bend count says.
+    pub payload: Vec<u8>,
+}
+
+/// A machine that takes tables by stage, verify, commit.
+pub trait Bender: Send {
+    /// What kind of machine it is.
+    fn profile(&self) -> &Profile;
+
+    /// Where it is, for people.
+    fn endpoint(&self) -> &str;
+
+    /// One look at the machine.
+    fn read_status(&mut self) -> impl Future<Output = Result<Status, LinkError>> + Send;
+
+    /// Writes a table to the staging area; the machine does not use it yet.
+    fn write_staging(&mut self, staged: &Staged) -> impl Future<Output = Result<(), LinkError>> + Send;
+
+    /// Reads back this many bytes of the staging area.
+    fn read_staging(&mut self, bytes: usize) -> impl Future<Output = Result<Vec<u8>, LinkError>> + Send;
+
+    /// Writes the commit word, once, never repeated by the link.
+    fn commit(&mut self, id: TableId) -> impl Future<Output = Result<(), LinkError>> + Send;
+
+    /// Reads status and active table.
+    fn read_active(&mut self) -> impl Future<Output = Result<ActiveTable, LinkError>> + Send;
+}

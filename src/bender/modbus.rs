@@ -1,0 +1,249 @@
+//! The Modbus TCP link: one request in flight, every reply checked, the connection dropped on any doubt.
+//!
+//! tokio-modbus has no deadlines and checks neither the count of a read nor the echo of a write; after a
+//! timeout a TCP stream stays off by one. So each call here has a deadline, compares what came with what was
+//! asked, and keeps the connection only when all is right; the next call opens a new one. A call that is
+//! cancelled drops its connection too, since the connection is taken out of `self` while it runs.
+
+use std::borrow::Cow;
+
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_modbus::client::{Client as _, Context, tcp};
+use tokio_modbus::{ExceptionCode, Request, Response, Slave};
+
+use super::link::{ActiveTable, Bender, LinkError};
+use super::profile::Profile;
+use super::wire::{
+    Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image, status_span,
+};
+
+/// How often a device that says "busy" is asked again.
+const BUSY_RETRIES: u32 = 3;
+
+/// A bender behind Modbus TCP.
+pub struct ModbusLink {
+    profile: Profile,
+    endpoint: String,
+    connection: Option<Context>,
+}
+
+impl ModbusLink {
+    /// A link that connects at its first use; `endpoint` is `host:port`.
+    pub fn new(profile: Profile, endpoint: impl Into<String>) -> ModbusLink {
+        ModbusLink { profile, endpoint: endpoint.into(), connection: None }
+    }
+
+    async fn connect(&mut self) -> Result<Context, LinkError> {
+        let failed = |why: String| LinkError::Connect { endpoint: self.endpoint.clone(), why };
+        let limit = self.profile.deadlines.connect;
+        let stream = timeout(limit, TcpStream::connect(&self.endpoint))
+            .await
+            .map_err(|_| failed(format!("no answer within {} ms", limit.as_millis())))?
+            .map_err(|e| failed(e.to_string()))?;
+        // Small requests wait for each other otherwise; a socket that cannot do this still works.
+        let _ = stream.set_nodelay(true);
+        Ok(tcp::attach_slave(stream, Slave(self.profile.unit_id)))
+    }
+
+    /// One request and its checked reply.
+    async fn call(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
+        let mut connection = match self.connection.take() {
+            Some(connection) => connection,
+            None => self.connect().await?,
+        };
+        let (endpoint, what) = (self.endpoint.clone(), describe(&request));
+        let limit = self.profile.deadlines.request;
+        match timeout(limit, connection.call(request.clone())).await {
+            Err(_) => Err(LinkError::Timeout { endpoint, what, ms: limit.as_millis() }),
+            Ok(Err(error)) => Err(LinkError::Broken { endpoint, what, why: explain(&error) }),
+            Ok(Ok(Err(exception))) => {
+                self.connection = Some(connection); // a refusal is a proper answer
+                Err(LinkError::Exception { endpoint, what, exception: name(exception) })
+            }
+            Ok(Ok(Ok(response))) => match fits(&request, response) {
+                Ok(words) => {
+                    self.connection = Some(connection);
+                    Ok(words)
+                }
+                Err(why) => Err(LinkError::Broken { endpoint, what, why }),
+            },
+        }
+    }
+
+    /// The same for requests that may be repeated: "busy" is asked again, a few times.
+    async fn call_patiently(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
+        let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
+        let pause = std::time::Duration::from_millis(self.profile.deadlines.poll_ms);
+        for _ in 0..BUSY_RETRIES {
+            match self.call(request.clone()).await {
+                Err(LinkError::Exception { exception, .. }) if busy.contains(&exception) => {
+                    tokio::time::sleep(pause).await;
+                }
+                other => return other,
+            }
+        }
+        self.call(request).await
+    }
+
+    async fn read(&mut self, address: u16, bytes: usize) -> Result<Vec<u8>, LinkError> {
+        let mut out = Vec::with_capacity(bytes);
+        for (at, count) in chunks(address, bytes / 2, self.profile.modbus.max_read_registers) {
+            let words = self.call_patiently(Request::ReadHoldingRegisters(at, count)).await?;
+            out.extend(words.into_iter().flat_map(u16::to_be_bytes));
+        }
+        Ok(out)
+    }
+
+    fn nonsense(&self, why: String) -> LinkError {
+        LinkError::Nonsense { endpoint: self.endpoint.clone(), why }
+    }
+}
+
+impl Bender for ModbusLink {
+    fn profile(&self) -> &Profile {
+        &self.profile
+    }
+
+    fn endpoint(&self) -> &str {
+        &self.endpoint
+    }
+
+    async fn read_status(&mut self) -> Result<Status, LinkError> {
+        let (first, count) = status_span(&self.profile);
+        let bytes = self.read(first, 2 * usize::from(count)).await?;
+        decode_status(&self.profile, &bytes).map_err(|why| self.nonsense(why))
+    }
+
+    async fn write_staging(&mut self, staged: &Staged) -> Result<(), LinkError> {
+        let words = words_of(&staging_image(&self.profile, staged));
+        let mut rest = &words[..];
+        let staging = self.profile.registers.staging;
+        for (at, count) in chunks(staging, words.len(), self.profile.modbus.max_write_registers) {
+            let (now, later) = rest.split_at(usize::from(count));
+            self.call_patiently(Request::WriteMultipleRegisters(at, Cow::Borrowed(now))).await?;
+            rest = later;
+        }
+        Ok(())
+    }
+
+    async fn read_staging(&mut self, bytes: usize) -> Result<Vec<u8>, LinkError> {
+        self.read(self.profile.registers.staging, bytes).await
+    }
+
+    async fn commit(&mut self, id: TableId) -> Result<(), LinkError> {
+        let words = words_of(&commit_image(&self.profile, id));
+        self.call(Request::WriteMultipleRegisters(self.profile.registers.commit, Cow::Owned(words))).await?;
+        Ok(())
+    }
+
+    async fn read_active(&mut self) -> Result<ActiveTable, LinkError> {
+        let status = self.read_status().await?;
+        let (address, header) = (self.profile.registers.active, self.profile.payload_header_bytes());
+        if status.active.revision == 0 {
+            return Ok(ActiveTable { status, payload: Vec::new() });
+        }
+        let mut payload = self.read(address, header).await?;
+        let name = 2 * usize::from(self.profile.table.program_registers);
+        let bends = usize::from(u16::from_be_bytes([payload[name], payload[name + 1]]));
+        let most = self.profile.limits.max_bends;
+        if bends > most {
+            return Err(
+                self.nonsense(format!("the active table says {bends} bends, its area has room for {most}"))
+            );
+        }
+        let rows = address + (header / 2) as u16; // the profile's check keeps the area below 65536
+        payload.extend(self.read(rows, payload_bytes(&self.profile, bends) - header).await?);
+        let crc = crc_of(&payload);
+        if crc != status.active.crc {
+            return Err(self.nonsense(format!(
+                "the active rows have CRC {crc:08X}, the machine says {}: caught in a change, or damaged",
+                status.active
+            )));
+        }
+        Ok(ActiveTable { status, payload })
+    }
+}
+
+/// Start and count of each request; `limit` is even and so is the distance of every 32-bit value from the
+/// start, so none is split.
+fn chunks(address: u16, registers: usize, limit: u16) -> impl Iterator<Item = (u16, u16)> {
+    let step = usize::from(limit);
+    (0..registers).step_by(step).map(move |done| (address + done as u16, step.min(registers - done) as u16))
+}
+
+fn words_of(bytes: &[u8]) -> Vec<u16> {
+    bytes.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect()
+}
+
+fn describe(request: &Request<'_>) -> String {
+    match request {
+        Request::ReadHoldingRegisters(at, count) => format!("reading registers {at} to {}", at + (count - 1)),
+        Request::WriteMultipleRegisters(at, words) => {
+            format!("writing registers {at} to {}", usize::from(*at) + words.len() - 1)
+        }
+        other => format!("calling function {}", other.function_code()),
+    }
+}
+
+/// The words read (none for a write), if the reply is the one to this request.
+fn fits(request: &Request<'_>, response: Response) -> Result<Vec<u16>, String> {
+    match (request, response) {
+        (Request::ReadHoldingRegisters(_, count), Response::ReadHoldingRegisters(words)) => {
+            if words.len() == usize::from(*count) {
+                Ok(words)
+            } else {
+                Err(format!("the answer has {} registers instead of {count}", words.len()))
+            }
+        }
+        (Request::WriteMultipleRegisters(at, words), Response::WriteMultipleRegisters(echo, count)) => {
+            if echo == *at && usize::from(count) == words.len() {
+                Ok(Vec::new())
+            } else {
+                Err(format!("the answer confirms {count} registers from {echo}"))
+            }
+        }
+        (_, other) => Err(format!("the answer is to function {}", other.function_code())),
+    }
+}
+
+fn explain(error: &tokio_modbus::Error) -> String {
+    match error {
+        // The library reports a closed stream as whatever errno was last, often "Success".
+        tokio_modbus::Error::Transport(e) if matches!(e.raw_os_error(), Some(0 | 11 | 115)) => {
+            "the machine closed the connection".into()
+        }
+        other => other.to_string(),
+    }
+}
+
+fn name(exception: ExceptionCode) -> String {
+    format!("{exception} (exception {})", u8::from(exception))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_cover_everything_and_start_even() {
+        let list = |registers, limit| chunks(1000, registers, limit).collect::<Vec<_>>();
+        assert_eq!(list(100, 100), [(1000, 100)]);
+        assert_eq!(list(101, 100), [(1000, 100), (1100, 1)]);
+        assert_eq!(list(264, 100), [(1000, 100), (1100, 100), (1200, 64)]);
+        assert_eq!(list(0, 100), []);
+    }
+
+    #[test]
+    fn a_reply_of_another_length_or_place_does_not_fit() {
+        let read = Request::ReadHoldingRegisters(10, 3);
+        assert_eq!(fits(&read, Response::ReadHoldingRegisters(vec![1, 2, 3])), Ok(vec![1, 2, 3]));
+        assert!(fits(&read, Response::ReadHoldingRegisters(vec![1, 2])).is_err());
+        assert!(fits(&read, Response::ReadHoldingRegisters(vec![1, 2, 3, 4])).is_err());
+        assert!(fits(&read, Response::WriteMultipleRegisters(10, 3)).is_err());
+        let write = Request::WriteMultipleRegisters(10, Cow::Owned(vec![1, 2]));
+        assert!(fits(&write, Response::WriteMultipleRegisters(10, 2)).is_ok());
+        assert!(fits(&write, Response::WriteMultipleRegisters(11, 2)).is_err());
+        assert!(fits(&write, Response::WriteMultipleRegisters(10, 1)).is_err());
+    }
+}

@@ -1,0 +1,155 @@
+//! What one machine is: addresses, scales, limits and deadlines, read from a file in `protocols/`.
+//!
+//! Code knows no machine; it knows this type. Every field is checked when the file is read
+//! (`profile_file`), so the rest of the room may rely on the ranges written here.
+
+use std::time::Duration;
+
+use crate::tube::MachineLimits;
+
+/// One machine's description, validated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Profile {
+    /// Short name, as in `--bender NAME`.
+    pub name: String,
+    /// One line for people.
+    pub description: String,
+    /// Where the machine is, `host:port`.
+    pub endpoint: String,
+    /// Modbus unit identifier.
+    pub unit_id: u8,
+    /// Word order and request sizes.
+    pub modbus: ModbusFormat,
+    /// Where things are.
+    pub registers: Registers,
+    /// Value of the identification register.
+    pub identification: u32,
+    /// Value of the layout register.
+    pub layout: u16,
+    /// How a table is written in integers.
+    pub table: TableFormat,
+    /// Bits of the state word that must hold before anything is sent.
+    pub state_bits: Vec<StateBit>,
+    /// What the machine can do.
+    pub limits: MachineLimits,
+    /// How long to wait for what.
+    pub deadlines: Deadlines,
+}
+
+/// Word order and request sizes of one Modbus device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModbusFormat {
+    /// Order of the four bytes of a 32-bit value.
+    pub word_order: WordOrder,
+    /// Registers per read request, even, 4 to 125.
+    pub max_read_registers: u16,
+    /// Registers per write request, even, 4 to 123.
+    pub max_write_registers: u16,
+}
+
+/// How the bytes of a 32-bit value lie in two registers, `A` being the most significant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WordOrder {
+    /// High word first, the common order.
+    Abcd,
+    /// Low word first.
+    Cdab,
+    /// High word first, bytes swapped in each.
+    Badc,
+    /// Low word first, bytes swapped in each.
+    Dcba,
+}
+
+impl WordOrder {
+    /// The bytes in the order in which they go over the wire; its own inverse.
+    pub fn arrange(self, [a, b, c, d]: [u8; 4]) -> [u8; 4] {
+        match self {
+            WordOrder::Abcd => [a, b, c, d],
+            WordOrder::Cdab => [c, d, a, b],
+            WordOrder::Badc => [b, a, d, c],
+            WordOrder::Dcba => [d, c, b, a],
+        }
+    }
+}
+
+/// Addresses of holding registers, counted from 0. No two areas overlap.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Registers {
+    /// u32 constant that proves map and word order.
+    pub identification: u16,
+    /// u16 constant, version of the layout.
+    pub layout: u16,
+    /// u16 that counts up while the controller's program runs.
+    pub heartbeat: u16,
+    /// u16 state word.
+    pub state: u16,
+    /// u16, bends of the loaded program.
+    pub bend_count: u16,
+    /// Text, name of the loaded program.
+    pub program: u16,
+    /// u32, revision of the table in force.
+    pub active_revision: u16,
+    /// u32, CRC of the table in force.
+    pub active_crc: u16,
+    /// u32, revision that the last acknowledgement speaks of.
+    pub ack_revision: u16,
+    /// u16, the acknowledgement.
+    pub ack_code: u16,
+    /// u32 revision and u32 CRC, the commit word; the controller clears it when it has dealt with it.
+    pub commit: u16,
+    /// u32 revision, u32 CRC, then the payload.
+    pub staging: u16,
+    /// The payload in force.
+    pub active: u16,
+}
+
+/// How a table is written in integers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TableFormat {
+    /// Registers of a program name, even, two characters each.
+    pub program_registers: u16,
+    /// Millimetres per count.
+    pub length_resolution_mm: f64,
+    /// Degrees per count, for angles and rotations.
+    pub angle_resolution_deg: f64,
+    /// Whether the machine turns the plane the other way than LRA's right hand.
+    pub rotation_reversed: bool,
+}
+
+/// One condition on the state word.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StateBit {
+    /// Bit number, 0 is the least significant.
+    pub bit: u8,
+    /// What it says when set.
+    pub name: String,
+    /// The value without which nothing is sent.
+    pub must_be: bool,
+}
+
+/// How long to wait for what.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Deadlines {
+    /// To open the connection.
+    pub connect: Duration,
+    /// For one reply.
+    pub request: Duration,
+    /// Longest time in which a live machine's heartbeat stands still, milliseconds.
+    pub heartbeat_ms: u64,
+    /// From the commit to the table being active, milliseconds.
+    pub confirm_ms: u64,
+    /// Longest time in which a commit that was sent may still arrive, milliseconds.
+    pub settle_ms: u64,
+    /// Between two looks at the machine, milliseconds.
+    pub poll_ms: u64,
+}
+
+impl Profile {
+    /// Bytes of a payload before its first row: program, count, spare, last length.
+    pub fn payload_header_bytes(&self) -> usize {
+        2 * (usize::from(self.table.program_registers) + 4)
+    }
+
+    /// Bytes of one row: length, rotation, angle, four each.
+    pub const ROW_BYTES: usize = 12;
+}

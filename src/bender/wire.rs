@@ -1,0 +1,415 @@
+//! Tables to bytes and back, the CRC over them, and the status word by word.
+//!
+//! Bytes are in the order in which registers go over the wire (high byte first); what is 32 bits wide is
+//! arranged by the profile's word order. A payload is
+//!
+//! ```text
+//! program      2 x program_registers bytes of ASCII, padded with zero
+//! bend count   u16
+//! spare        u16, 0
+//! last length  i32
+//! rows         bend count x (length i32, rotation i32, angle i32)
+//! ```
+//!
+//! The CRC-32 (IEEE 802.3) covers the whole payload, the program's name included: a table staged for one
+//! program can never be taken for the table of another.
+
+use serde::Serialize;
+
+use super::limits::Reason;
+use super::profile::{Profile, WordOrder};
+use crate::tube::{CommandRow, CommandTable};
+
+/// Which table: its revision and the CRC of its payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize)]
+pub struct TableId {
+    /// Counts up by one with every table taken over; 0 means no table.
+    pub revision: u32,
+    /// CRC-32 over the payload.
+    pub crc: u32,
+}
+
+impl std::fmt::Display for TableId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.revision {
+            0 => write!(f, "none"),
+            revision => write!(f, "revision {revision}, CRC {:08X}", self.crc),
+        }
+    }
+}
+
+/// What the machine answered to a commit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ack {
+    /// Nothing yet.
+    None,
+    /// Taken over.
+    Taken,
+    /// Refused, with the code of the wire contract.
+    Refused(u16),
+}
+
+impl Ack {
+    /// From the register.
+    pub fn from_code(code: u16) -> Ack {
+        match code {
+            0 => Ack::None,
+            1 => Ack::Taken,
+            code => Ack::Refused(code),
+        }
+    }
+
+    /// What a code of refusal means.
+    pub fn meaning(code: u16) -> &'static str {
+        match code {
+            2 => "revision or CRC of the commit are not those of the staging area",
+            3 => "the staged rows do not have the staged CRC",
+            4 => "the machine is not between parts",
+            5 => "another program is loaded",
+            6 => "the loaded program has another number of bends",
+            7 => "the revision is not the active one plus 1",
+            8 => "a value is outside the machine's own limits",
+            _ => "a code that the wire contract does not name",
+        }
+    }
+}
+
+/// One look at the machine, all of one moment.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Status {
+    /// Counts up while the controller's program runs.
+    pub heartbeat: u16,
+    /// State word, bits as the profile names them.
+    pub state: u16,
+    /// Name of the loaded program.
+    pub program: String,
+    /// Bends of the loaded program.
+    pub bend_count: u16,
+    /// The table in force.
+    pub active: TableId,
+    /// The revision that `ack` speaks of.
+    pub ack_revision: u32,
+    /// The last acknowledgement.
+    pub ack: Ack,
+    /// A commit that the controller has not dealt with yet (revision 0: none).
+    pub pending: TableId,
+}
+
+/// A table ready to be staged.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Staged {
+    /// Its name.
+    pub id: TableId,
+    /// Its bytes.
+    pub payload: Vec<u8>,
+}
+
+/// CRC-32 (IEEE 802.3) of a payload.
+pub fn crc_of(payload: &[u8]) -> u32 {
+    crc32fast::hash(payload)
+}
+
+/// A table as bytes; every reason why it cannot be written down.
+pub fn encode_payload(
+    profile: &Profile,
+    program: &str,
+    table: &CommandTable,
+) -> Result<Vec<u8>, Vec<Reason>> {
+    let mut reasons = Vec::new();
+    let mut out = program_bytes(profile, program).unwrap_or_else(|reason| {
+        reasons.push(reason);
+        Vec::new()
+    });
+    let count = u16::try_from(table.bends.len()).unwrap_or(u16::MAX); // more rows than that break a limit anyway
+    out.extend(count.to_be_bytes());
+    out.extend([0, 0]);
+    let (mm, deg) = (profile.table.length_resolution_mm, profile.table.angle_resolution_deg);
+    let sign = if profile.table.rotation_reversed { -1.0 } else { 1.0 };
+    let mut put =
+        |bend: Option<usize>, what: &str, value: f64, resolution: f64| match counts(value, resolution) {
+            Some(count) => out.extend(profile.modbus.word_order.arrange(count.to_be_bytes())),
+            None => reasons.push(Reason::new(
+                "not_encodable",
+                bend,
+                format!("{what} {value} does not fit the machine's numbers (steps of {resolution})"),
+            )),
+        };
+    put(None, "last length_mm", table.last_length_mm, mm);
+    for (i, row) in table.bends.iter().enumerate() {
+        put(Some(i + 1), "length_mm", row.length_mm, mm);
+        put(Some(i + 1), "rotation_deg", sign * row.rotation_rad.to_degrees(), deg);
+        put(Some(i + 1), "angle_deg", row.angle_rad.to_degrees(), deg);
+    }
+    if reasons.is_empty() { Ok(out) } else { Err(reasons) }
+}
+
+/// Program and table of a payload; why not, in words.
+pub fn decode_payload(profile: &Profile, payload: &[u8]) -> Result<(String, CommandTable), String> {
+    let header = profile.payload_header_bytes();
+    if payload.len() < header {
+        return Err(format!("a payload has at least {header} bytes, found {}", payload.len()));
+    }
+    let name = 2 * usize::from(profile.table.program_registers);
+    let count = usize::from(u16::from_be_bytes([payload[name], payload[name + 1]]));
+    let expected = header + count * Profile::ROW_BYTES;
+    if payload.len() != expected {
+        return Err(format!("{count} bends make {expected} bytes, found {}", payload.len()));
+    }
+    let (mm, deg) = (profile.table.length_resolution_mm, profile.table.angle_resolution_deg);
+    let sign = if profile.table.rotation_reversed { -1.0 } else { 1.0 };
+    let order = profile.modbus.word_order;
+    let value = |at: usize, resolution: f64| f64::from(u32_at(order, payload, at) as i32) * resolution;
+    let row = |i: usize| {
+        let at = header + i * Profile::ROW_BYTES;
+        CommandRow {
+            length_mm: value(at, mm),
+            rotation_rad: (sign * value(at + 4, deg)).to_radians(),
+            angle_rad: value(at + 8, deg).to_radians(),
+        }
+    };
+    let table = CommandTable { bends: (0..count).map(row).collect(), last_length_mm: value(header - 4, mm) };
+    Ok((text_of(&payload[..name]), table))
+}
+
+/// Bytes of a payload with this many bends.
+pub fn payload_bytes(profile: &Profile, bends: usize) -> usize {
+    profile.payload_header_bytes() + bends * Profile::ROW_BYTES
+}
+
+/// What stands in the staging area for this table: revision, CRC, payload.
+pub fn staging_image(profile: &Profile, staged: &Staged) -> Vec<u8> {
+    let mut image = commit_image(profile, staged.id);
+    image.extend(&staged.payload);
+    image
+}
+
+/// What is written to the commit word for this table: revision, CRC.
+pub fn commit_image(profile: &Profile, id: TableId) -> Vec<u8> {
+    let order = profile.modbus.word_order;
+    [order.arrange(id.revision.to_be_bytes()), order.arrange(id.crc.to_be_bytes())].concat()
+}
+
+/// First address and number of registers of the status.
+pub fn status_span(profile: &Profile) -> (u16, u16) {
+    let r = &profile.registers;
+    let areas = [
+        (r.identification, 2),
+        (r.layout, 1),
+        (r.heartbeat, 1),
+        (r.state, 1),
+        (r.bend_count, 1),
+        (r.program, profile.table.program_registers),
+        (r.active_revision, 2),
+        (r.active_crc, 2),
+        (r.ack_revision, 2),
+        (r.ack_code, 1),
+        (r.commit, 4),
+    ];
+    let first = areas.iter().map(|a| a.0).min().unwrap_or(0);
+    let end = areas.iter().map(|a| u32::from(a.0) + u32::from(a.1)).max().unwrap_or(0);
+    (first, (end - u32::from(first)) as u16)
+}
+
+/// The status from the bytes of [`status_span`]; an error names the constant that is wrong.
+pub fn decode_status(profile: &Profile, bytes: &[u8]) -> Result<Status, String> {
+    let (first, count) = status_span(profile);
+    if bytes.len() != 2 * usize::from(count) {
+        return Err(format!("a status has {count} registers, found {}", bytes.len() / 2));
+    }
+    let (r, order) = (&profile.registers, profile.modbus.word_order);
+    let at = |address: u16| 2 * usize::from(address - first);
+    let long = |address: u16| u32_at(order, bytes, at(address));
+    let word = |address: u16| u16::from_be_bytes([bytes[at(address)], bytes[at(address) + 1]]);
+    if long(r.identification) != profile.identification {
+        return Err(format!(
+            "register {} holds 0x{:08X} where profile {:?} expects 0x{:08X}: not this machine, or another word \
+             order or address base",
+            r.identification,
+            long(r.identification),
+            profile.name,
+            profile.identification
+        ));
+    }
+    if word(r.layout) != profile.layout {
+        return Err(format!(
+            "register {} says layout {}, profile {:?} is for layout {}",
+            r.layout,
+            word(r.layout),
+            profile.name,
+            profile.layout
+        ));
+    }
+    let program = at(r.program)..at(r.program) + 2 * usize::from(profile.table.program_registers);
+    Ok(Status {
+        heartbeat: word(r.heartbeat),
+        state: word(r.state),
+        program: text_of(&bytes[program]),
+        bend_count: word(r.bend_count),
+        active: TableId { revision: long(r.active_revision), crc: long(r.active_crc) },
+        ack_revision: long(r.ack_revision),
+        ack: Ack::from_code(word(r.ack_code)),
+        pending: TableId { revision: long(r.commit), crc: long(r.commit + 2) },
+    })
+}
+
+/// The value in whole steps, if an i32 can hold it.
+pub(super) fn counts(value: f64, resolution: f64) -> Option<i32> {
+    let steps = (value / resolution).round();
+    (steps.abs() <= f64::from(i32::MAX)).then_some(steps as i32)
+}
+
+fn u32_at(order: WordOrder, bytes: &[u8], at: usize) -> u32 {
+    u32::from_be_bytes(order.arrange([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
+}
+
+fn program_bytes(profile: &Profile, program: &str) -> Result<Vec<u8>, Reason> {
+    let longest = 2 * usize::from(profile.table.program_registers);
+    let printable = |b: u8| b == b' ' || b.is_ascii_graphic();
+    if program.trim_matches(' ').is_empty() || program.len() > longest || !program.bytes().all(printable) {
+        let text = format!("program name {program:?}, allowed are 1 to {longest} ASCII characters");
+        return Err(Reason::new("program_name", None, text));
+    }
+    let mut out = program.trim_end_matches(' ').as_bytes().to_vec();
+    out.resize(longest, 0);
+    Ok(out)
+}
+
+/// Up to the first zero, without the blanks with which some controllers pad; what is not ASCII becomes '?'.
+fn text_of(bytes: &[u8]) -> String {
+    let used = bytes.split(|b| *b == 0).next().unwrap_or(&[]);
+    let character = |b: &u8| if *b == b' ' || b.is_ascii_graphic() { char::from(*b) } else { '?' };
+    used.iter().map(character).collect::<String>().trim_end_matches(' ').to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn profile() -> Profile {
+        Profile::load("reference-modbus").unwrap()
+    }
+
+    fn table() -> CommandTable {
+        let row = |l: f64, r: f64, a: f64| CommandRow {
+            length_mm: l,
+            rotation_rad: r.to_radians(),
+            angle_rad: a.to_radians(),
+        };
+        CommandTable {
+            bends: vec![row(120.0, 0.0, 92.1), row(150.004, -60.0, 181.2345)],
+            last_length_mm: 99.996,
+        }
+    }
+
+    #[test]
+    fn bytes_of_a_table_written_out_by_hand() {
+        let bytes = encode_payload(&profile(), "AB-1", &table()).unwrap();
+        assert_eq!(&bytes[..6], b"AB-1\0\0");
+        let tail = &bytes[32..];
+        let expected: [i32; 7] = [10_000, 12_000, 0, 92_100, 15_000, -60_000, 181_235];
+        assert_eq!(&tail[..4], &[0, 2, 0, 0]);
+        assert_eq!(&tail[4..], expected.map(i32::to_be_bytes).concat());
+        assert_eq!(crc_of(b"123456789"), 0xCBF4_3926, "the check value of CRC-32/ISO-HDLC");
+    }
+
+    #[test]
+    fn word_orders_of_one_number() {
+        let mut p = profile();
+        let header = p.payload_header_bytes();
+        for (order, bytes) in [
+            (WordOrder::Abcd, [0, 1, 0xD4, 0xC0]),
+            (WordOrder::Cdab, [0xD4, 0xC0, 0, 1]),
+            (WordOrder::Badc, [1, 0, 0xC0, 0xD4]),
+            (WordOrder::Dcba, [0xC0, 0xD4, 1, 0]),
+        ] {
+            p.modbus.word_order = order;
+            let row = CommandRow { length_mm: 1200.0, rotation_rad: 0.0, angle_rad: 0.0 };
+            let one = CommandTable { bends: vec![row], last_length_mm: 0.0 };
+            let payload = encode_payload(&p, "A", &one).unwrap();
+            assert_eq!(payload[header..header + 4], bytes, "{order:?}");
+        }
+    }
+
+    #[test]
+    fn a_reversed_machine_gets_the_other_sign_and_reads_back_the_same() {
+        let mut p = profile();
+        p.table.rotation_reversed = true;
+        let payload = encode_payload(&p, "A", &table()).unwrap();
+        let at = p.payload_header_bytes() + 12 + 4;
+        assert_eq!(payload[at..at + 4], 60_000_i32.to_be_bytes());
+        let (_, back) = decode_payload(&p, &payload).unwrap();
+        assert!((back.bends[1].rotation_rad.to_degrees() + 60.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_cannot_be_written_down_is_refused_with_its_row() {
+        let refused = |program: &str, table: &CommandTable| {
+            let reasons = encode_payload(&profile(), program, table).unwrap_err();
+            reasons.into_iter().map(|r| (r.code, r.bend)).collect::<Vec<_>>()
+        };
+        let mut bad = table();
+        bad.bends[1].length_mm = f64::NAN;
+        assert_eq!(refused("A", &bad), [("not_encodable", Some(2))]);
+        bad.bends[1].length_mm = 21_474_836.48; // i32::MAX + 1 steps of 0.01
+        assert_eq!(refused("A", &bad), [("not_encodable", Some(2))]);
+        assert_eq!(refused("", &table()), [("program_name", None)]);
+        assert_eq!(refused(&"x".repeat(33), &table()), [("program_name", None)]);
+        assert_eq!(refused("Bügel", &table()), [("program_name", None)]);
+        assert!(encode_payload(&profile(), &"x".repeat(32), &table()).is_ok());
+    }
+
+    #[test]
+    fn a_foreign_constant_is_named() {
+        let p = profile();
+        let (_, count) = status_span(&p);
+        assert_eq!(status_span(&p), (0, 36));
+        let mut bytes = vec![0; 2 * usize::from(count)];
+        assert!(decode_status(&p, &bytes).unwrap_err().contains("register 0 holds 0x00000000"));
+        bytes[..4].copy_from_slice(b"NDBE");
+        assert!(decode_status(&p, &bytes).unwrap_err().contains("word order"));
+        bytes[..4].copy_from_slice(b"BEND");
+        assert!(decode_status(&p, &bytes).unwrap_err().contains("register 2 says layout 0"));
+        bytes[5] = 1;
+        assert_eq!(decode_status(&p, &bytes).unwrap().active, TableId::default());
+        assert!(decode_status(&p, &bytes[2..]).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn a_table_comes_back_within_half_a_step(
+            rows in prop::collection::vec((0.0..6000.0, -360.0..360.0, 0.0..359.0), 0..40),
+            last in 0.0..6000.0,
+            reversed: bool,
+            order in prop::sample::select(vec![WordOrder::Abcd, WordOrder::Cdab, WordOrder::Badc, WordOrder::Dcba]),
+        ) {
+            let mut p = profile();
+            p.table.rotation_reversed = reversed;
+            p.modbus.word_order = order;
+            let bends = rows.iter().map(|(l, r, a): &(f64, f64, f64)| CommandRow {
+                length_mm: *l, rotation_rad: r.to_radians(), angle_rad: a.to_radians(),
+            }).collect();
+            let table = CommandTable { bends, last_length_mm: last };
+            let payload = encode_payload(&p, "P1", &table).unwrap();
+            let (program, back) = decode_payload(&p, &payload).unwrap();
+            prop_assert_eq!(program, "P1");
+            prop_assert_eq!(back.bends.len(), table.bends.len());
+            for (a, b) in table.bends.iter().zip(&back.bends) {
+                prop_assert!((a.length_mm - b.length_mm).abs() <= 0.005 + 1e-9);
+                prop_assert!((a.rotation_rad - b.rotation_rad).to_degrees().abs() <= 0.0005 + 1e-9);
+                prop_assert!((a.angle_rad - b.angle_rad).to_degrees().abs() <= 0.0005 + 1e-9);
+            }
+            // A table that came from the wire goes back to the same bytes.
+            prop_assert_eq!(encode_payload(&p, "P1", &back).unwrap(), payload);
+        }
+
+        #[test]
+        fn any_bytes_decode_or_say_why(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+            let p = profile();
+            if let Ok((_, table)) = decode_payload(&p, &bytes) {
+                prop_assert_eq!(bytes.len(), payload_bytes(&p, table.bends.len()));
+            }
+            let _ = decode_status(&p, &bytes);
+        }
+    }
+}
