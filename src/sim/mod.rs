@@ -2,3 +2,6 @@
 
 pub mod bender;
 pub mod bender_server;
+mod forming;
+
+pub use forming::{FormedTube, Plant};
