@@ -41,7 +41,7 @@ fn tube() -> Box<MeasuredTube> {
 }
 
 fn decision(verdict: Verdict) -> Box<Decision> {
-    Box::new(Decision { verdict, table: table(7.0), reasons: "why".into() })
+    Box::new(Decision { verdict, table: table(7.0), reasons: "why".into(), inspection: None })
 }
 
 impl Bench {
@@ -156,6 +156,7 @@ impl Bench {
             ("machine lost", Event::MachineLost(t, "gone".into())),
             ("late machine read", Event::MachineRead(old, in_force(2))),
             ("scan", Event::Scan(scan())),
+            ("filing failed", Event::FilingFailed("no permission".into())),
             ("measured", Event::Measured(t, tube())),
             ("measuring failed", Event::MeasureFailed(t, "a cube".into())),
             ("late measured", Event::Measured(old, tube())),

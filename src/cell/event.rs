@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use crate::arm::ScanFile;
 use crate::bender::TableId;
+use crate::inspect::Inspection;
 use crate::tube::{CommandTable, MeasuredTube};
 
 /// Names one piece of work asked for; its result carries the same. A result whose ticket is not the current one
@@ -31,10 +32,14 @@ pub struct Decision {
     pub table: CommandTable,
     /// Reasons in words, for the operator.
     pub reasons: String,
+    /// The last part against its nominal, as decided on; none for a first piece. For people and the journal: the
+    /// cell itself does not look at it.
+    pub inspection: Option<Box<Inspection>>,
 }
 
 /// The verdict of one decision.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Verdict {
     /// No part yet: start with this table.
     FirstPiece,
@@ -78,6 +83,8 @@ pub enum Event {
     MachineLost(Ticket, String),
     /// A complete scan is there.
     Scan(ScanFile),
+    /// Scans cannot be filed away: the next one could be an old one.
+    FilingFailed(String),
     /// The scan was measured.
     Measured(Ticket, Box<MeasuredTube>),
     /// The scan could not be measured.

@@ -5,6 +5,7 @@
 //! comes up, and comes back from every fault, disarmed. All transitions at a glance are in the snapshot beside
 //! `tests/cell.rs`.
 
+use std::fmt;
 use std::time::Duration;
 
 use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
@@ -62,6 +63,23 @@ pub struct Fault {
     pub reason: String,
     /// What to find out at the next contact.
     pub then: Purpose,
+}
+
+impl fmt::Display for State {
+    /// The state in the operator's words.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            State::Disarmed => f.write_str("disarmed"),
+            State::Reading(_) => f.write_str("reading the machine"),
+            State::Ready => f.write_str("waiting for a scan"),
+            State::InTolerance => f.write_str("in tolerance, waiting for a scan"),
+            State::Measuring(_) => f.write_str("measuring"),
+            State::Deciding(_) => f.write_str("deciding"),
+            State::Delivering(_) => f.write_str("delivering a table"),
+            State::Held(reason) => write!(f, "held: {reason}"),
+            State::Faulted(fault) => write!(f, "faulted: {}", fault.reason),
+        }
+    }
 }
 
 /// One part that was bent and measured.
@@ -138,6 +156,11 @@ impl Cell {
         matches!(self.state, State::Ready | State::InTolerance)
     }
 
+    /// Whether the work that carries this ticket is still waited for.
+    pub fn is_current(&self, ticket: Ticket) -> bool {
+        self.ticket == ticket
+    }
+
     /// When a [`Event::Tick`] is due: the end of the state's longest dwell, or the next attempt after a fault.
     pub fn wake_at(&self) -> Option<Duration> {
         let dwell = match &self.state {
@@ -165,6 +188,7 @@ impl Cell {
             (_, Event::Disarm) => self.disarm(),
             (state, Event::Tick) if self.wake_at().is_some_and(|at| at <= now) => self.overdue(state),
             (State::Ready | State::InTolerance, Event::Scan(scan)) => self.read(Purpose::Recall(scan)),
+            (State::Ready | State::InTolerance, Event::FilingFailed(reason)) => self.hold(reason),
             (State::Reading(why), Event::MachineRead(t, read)) if t == self.ticket => {
                 self.machine_read(why, read)
             }

@@ -8,6 +8,7 @@
 //! setup            benderd.toml's cell with everything it names
 //! ```
 
+mod driver;
 mod event;
 mod intents;
 mod journalling;
@@ -15,6 +16,7 @@ mod machine;
 mod measure;
 mod worker;
 
+pub use driver::{Command, Craft, Decided, Driver, Identity, Notice};
 pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
 pub use intents::JournalledIntents;
 pub use machine::{Cell, Fault, Part, Purpose, State};

@@ -82,7 +82,9 @@ impl<B: Bender> Worker<B> {
             0 => Default::default(),
             _ => match decode_payload(self.bender.profile(), &active.payload) {
                 Ok((_, table)) => table,
-                Err(why) => return Event::MachineLost(ticket, format!("its active table is unreadable: {why}")),
+                Err(why) => {
+                    return Event::MachineLost(ticket, format!("its active table is unreadable: {why}"));
+                }
             },
         };
         self.settle(id);
@@ -94,7 +96,8 @@ impl<B: Bender> Worker<B> {
         let Some(intended) = self.open.take() else { return };
         let applied = found == intended;
         tracing::warn!(cell = self.name, %intended, %found, applied, "an unfinished delivery is resolved");
-        let content = json!({ "machine": self.name, "intended": intended, "found": found, "applied": applied });
+        let content =
+            json!({ "machine": self.name, "intended": intended, "found": found, "applied": applied });
         record(&mut self.journal, "resolution", &content);
     }
 
@@ -135,10 +138,15 @@ fn open_intent(journal: &Journal, name: &str) -> Result<Option<TableId>, Journal
                 continue;
             }
             match record.kind.as_str() {
-                "intent" => open = serde_json::from_value(content["intent"]["new"].clone()).ok(),
+                "intent" => open = table_id(&content["intent"]["new"]),
                 "outcome" if content["result"]["outcome"] == "unknown" => {}
                 _ => open = None,
             }
         }
     }
+}
+
+fn table_id(value: &serde_json::Value) -> Option<TableId> {
+    let number = |key: &str| value[key].as_u64().and_then(|n| u32::try_from(n).ok());
+    Some(TableId { revision: number("revision")?, crc: number("crc")? })
 }

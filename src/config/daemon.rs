@@ -30,8 +30,8 @@ pub struct CellConfig {
     pub mode: Mode,
     /// Part file.
     pub part: PathBuf,
-    /// Machine profile.
-    pub profile: PathBuf,
+    /// Machine profile: the name of one that is built in, or a path.
+    pub profile: String,
     /// Machine as `host:port`.
     pub address: String,
     /// Folder that the scan program exports into.
@@ -79,7 +79,7 @@ struct RawCell {
     name: Spanned<String>,
     mode: Mode,
     part: PathBuf,
-    profile: PathBuf,
+    profile: String,
     address: Spanned<String>,
     scan: RawScan,
 }
@@ -147,12 +147,18 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         name: name.clone(),
         mode: raw.mode,
         part: base.join(&raw.part),
-        profile: base.join(&raw.profile),
+        profile: profile(&raw.profile, base),
         address: address.clone(),
         scan_folder: base.join(raw.scan.folder.get_ref()),
         scan_unit: raw.scan.unit,
         settle_ms: (settle_s * 1000.0) as u64,
     })
+}
+
+/// What looks like a file is one; any other word is a built-in profile's name.
+fn profile(text: &str, base: &Path) -> String {
+    let is_file = text.contains('/') || text.ends_with(".toml");
+    if is_file { base.join(text).display().to_string() } else { text.to_owned() }
 }
 
 /// Two cells on one machine would undo each other's tables; on one folder they would take each other's scans.
@@ -201,6 +207,9 @@ mod tests {
         let config = parse(&file(CELL)).unwrap();
         assert_eq!(config.state_dir, Path::new("/var/lib/benderd"));
         assert_eq!(config.cells[0].part, Path::new("/etc/benderd/p.toml"));
+        assert_eq!(config.cells[0].profile, "/etc/benderd/m.toml");
+        let named = parse(&file(&CELL.replace("m.toml", "reference-modbus"))).unwrap();
+        assert_eq!(named.cells[0].profile, "reference-modbus");
         assert_eq!((config.cells[0].scan_unit, config.cells[0].settle_ms), (ScanUnit::Mm, 1000));
     }
 
