@@ -11,6 +11,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use crate::cloud::Unit;
+
 /// Closes the loop on CNC tube bending.
 #[derive(Debug, Parser)]
 #[command(name = "benderd", version, about, max_term_width = 100)]
@@ -27,6 +29,28 @@ enum Command {
     Inspect(inspect::Args),
     /// Converts bending tables between LRA, XYZ and YBC.
     Convert(convert::Args),
+}
+
+/// Units in which scan files come.
+#[derive(Debug, Clone, Copy, Default, clap::ValueEnum)]
+pub enum ScanUnit {
+    /// Millimetres.
+    #[default]
+    Mm,
+    /// Metres.
+    M,
+    /// Inches.
+    Inch,
+}
+
+impl From<ScanUnit> for Unit {
+    fn from(unit: ScanUnit) -> Unit {
+        match unit {
+            ScanUnit::Mm => Unit::Millimetre,
+            ScanUnit::M => Unit::Metre,
+            ScanUnit::Inch => Unit::Inch,
+        }
+    }
 }
 
 /// How a subcommand ended; errors (unusable input, exit 2) travel as `anyhow::Error`.

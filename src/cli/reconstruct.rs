@@ -1,17 +1,83 @@
 //! `benderd reconstruct`: one scan to LRA.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
-use super::Outcome;
+use anyhow::Context;
+
+use super::{Outcome, ScanUnit};
+use crate::cloud::read_scan;
+use crate::config::{Materials, load_part};
+use crate::reconstruct::{Options, reconstruct};
+use crate::tube::MeasuredTube;
 
 /// Arguments of `benderd reconstruct`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The scan file.
+    /// The scan: PLY, XYZ, ASC, PTS or CSV.
     scan: PathBuf,
+    /// The part that the scan should show; its direction of travel is used.
+    #[arg(long, value_name = "PART")]
+    nominal: Option<PathBuf>,
+    /// Unit of the file's coordinates.
+    #[arg(long, value_enum, default_value_t)]
+    unit: ScanUnit,
+    /// Print one JSON object instead of the table.
+    #[arg(long)]
+    json: bool,
 }
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
-    anyhow::bail!("{}: reconstruction is being built", args.scan.display())
+    let nominal = match &args.nominal {
+        Some(path) => Some(load_part(path, &Materials::shipped()?)?),
+        None => None,
+    };
+    let started = Instant::now();
+    let scan = read_scan(&args.scan, args.unit.into())?;
+    let found = reconstruct(&scan.cloud, &Options { nominal: nominal.as_ref() })
+        .with_context(|| args.scan.display().to_string())?;
+    let mut measured = found.measured;
+    measured.elapsed_ms = (started.elapsed().as_secs_f64() * 1e4).round() / 10.0;
+    measured.scan_sha256 = scan.sha256;
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&measured)?);
+    } else {
+        scan.notes.iter().for_each(|note| println!("note: {note}"));
+        print!("{}", table(&measured));
+    }
+    Ok(Outcome::Done)
+}
+
+/// The measured tube for people.
+pub fn table(tube: &MeasuredTube) -> String {
+    let mut out = format!(
+        "tube radius {:.3} mm, {} of {} points used, median residual {:.3} mm, {:.0} ms\n",
+        tube.tube_radius_mm, tube.points_used, tube.points_total, tube.residual_median_mm, tube.elapsed_ms
+    );
+    if tube.reversed == Some(true) {
+        out += "the scan starts at the part's other end; turned round\n";
+    }
+    out += "bend        length mm      rotation deg         angle deg            CLR mm\n";
+    for (i, b) in tube.bends.iter().enumerate() {
+        let degrees = |rad: Option<f64>| rad.map(f64::to_degrees);
+        out += &format!(
+            "{:>4} {} {} {} {}\n",
+            i + 1,
+            cell(b.length_mm, b.length_sigma_mm),
+            cell(degrees(b.rotation_rad), degrees(b.rotation_sigma_rad)),
+            cell(degrees(Some(b.angle_rad)), degrees(Some(b.angle_sigma_rad))),
+            cell(b.radius_mm, b.radius_sigma_mm),
+        );
+    }
+    out += &format!(" end {}\n", cell(tube.last_length_mm, tube.last_length_sigma_mm));
+    tube.warnings.iter().for_each(|w| out += &format!("warning: {w}\n"));
+    out
+}
+
+fn cell(value: Option<f64>, sigma: Option<f64>) -> String {
+    match value {
+        Some(value) => format!("{value:>9.3} ±{:.3}", sigma.unwrap_or(0.0)).chars().take(16).collect(),
+        None => format!("{:>16}", "not known"),
+    }
 }

@@ -12,6 +12,9 @@ use crate::cloud::{Neighbours, PointCloud};
 /// A gap is bridged up to this many tube radii, when both ends point across it.
 const GAP_RADII: f64 = 10.0;
 
+/// Edges of the crust itself are no longer than this many spacings.
+const REACH_SPACINGS: f64 = 4.0;
+
 /// Neighbours that may be the nearest and the half neighbour.
 const LOOKED_AT: usize = 24;
 
@@ -24,6 +27,11 @@ pub struct Chains {
     pub closed: bool,
 }
 
+/// Length of a polygon without its bridges: what was really seen.
+pub fn solid_length_mm(chain: &[Point3<f64>], spacing_mm: f64) -> f64 {
+    chain.windows(2).map(|w| (w[1] - w[0]).norm()).filter(|l| *l < REACH_SPACINGS * spacing_mm).sum()
+}
+
 /// Length of a polygon.
 pub fn length_mm(chain: &[Point3<f64>]) -> f64 {
     chain.windows(2).map(|w| (w[1] - w[0]).norm()).sum()
@@ -31,7 +39,7 @@ pub fn length_mm(chain: &[Point3<f64>]) -> f64 {
 
 /// Joins points spaced by about `spacing_mm` on a tube of radius `radius_mm`.
 pub fn connect(points: &[SpinePoint], spacing_mm: f64, radius_mm: f64) -> Chains {
-    let wanted = wanted_edges(points, 4.0 * spacing_mm);
+    let wanted = wanted_edges(points, REACH_SPACINGS * spacing_mm);
     let mutual = |a: usize, b: usize| wanted[a].contains(&Some(b)) && wanted[b].contains(&Some(a));
     let links: Vec<Vec<usize>> = (0..points.len())
         .map(|a| wanted[a].iter().flatten().copied().filter(|&b| mutual(a, b)).collect())
@@ -41,7 +49,8 @@ pub fn connect(points: &[SpinePoint], spacing_mm: f64, radius_mm: f64) -> Chains
     join_ends(points, &mut pieces, radius_mm);
     let mut chains: Vec<Vec<Point3<f64>>> =
         pieces.into_iter().map(|piece| piece.into_iter().map(|i| points[i].point).collect()).collect();
-    chains.sort_by(|a: &Vec<Point3<f64>>, b| length_mm(b).total_cmp(&length_mm(a)));
+    let solid = |c: &Vec<Point3<f64>>| solid_length_mm(c, spacing_mm);
+    chains.sort_by(|a, b| solid(b).total_cmp(&solid(a)));
     Chains { chains, closed }
 }
 

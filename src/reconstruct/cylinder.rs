@@ -16,11 +16,24 @@ pub struct Cylinder {
     pub rms_mm: f64,
     /// Points that count.
     pub count: usize,
+    /// How far around it its points reach: 1 less the length of their mean normal, 0 for a single line, 1 all around.
+    /// A cylinder on the wrong side of a surface only touches it along a narrow strip.
+    pub opening: f64,
 }
 
 /// Support of the weights around the centre in tube radii: a piece of tube about 1.3 radii long (paper 000,
 /// section 3.2).
-pub const SUPPORT_RADII: f64 = 1.2;
+const SUPPORT_RADII: f64 = 1.2;
+
+impl Cylinder {
+    /// A first guess: a point near the axis and its direction.
+    pub fn guess(centre: Point3<f64>, axis: Vector3<f64>, radius_mm: f64) -> Cylinder {
+        Cylinder { centre, axis, radius_mm, rms_mm: 0.0, count: 0, opening: 0.0 }
+    }
+}
+
+/// Points that a fit needs to see around the first guess of its centre, in tube radii.
+pub const REACH_RADII: f64 = 1.5;
 
 /// Points farther from the cylinder than this share of its radius do not count (paper 000, section 7).
 const OUTLIER_RADII: f64 = 0.1;
@@ -49,6 +62,7 @@ pub fn fit_cylinder(points: &[Point3<f64>], start: &Cylinder, free_radius: bool)
             radius_mm: at.radius_mm + change[4],
             rms_mm: (sums.square / sums.weight).sqrt(),
             count: sums.count,
+            opening: 1.0 - sums.normals.norm() / sums.weight,
         };
         let sane = at.radius_mm > 0.5 * start.radius_mm && at.radius_mm < 2.0 * start.radius_mm;
         let stays =
@@ -71,11 +85,13 @@ fn across(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 }
 
 /// Normal equations of one Gauss-Newton step: shift and tilt across the axis, radius.
+#[derive(Default)]
 struct Sums {
     normal: Matrix5<f64>,
     right: Vector5<f64>,
     weight: f64,
     square: f64,
+    normals: Vector3<f64>,
     count: usize,
 }
 
@@ -83,8 +99,7 @@ impl Sums {
     fn over(points: &[Point3<f64>], at: &Cylinder, outlier_mm: f64) -> Sums {
         let (u, v) = across(&at.axis);
         let support = (SUPPORT_RADII * at.radius_mm).powi(2);
-        let mut sums =
-            Sums { normal: Matrix5::zeros(), right: Vector5::zeros(), weight: 0.0, square: 0.0, count: 0 };
+        let mut sums = Sums::default();
         for p in points {
             let from = p - at.centre;
             let along = from.dot(&at.axis);
@@ -96,6 +111,7 @@ impl Sums {
             if near <= 0.0 || good <= 0.0 || distance <= 0.0 {
                 continue;
             }
+
             let weight = near * near * good * good;
             let (mu, mv) = (across.dot(&u) / distance, across.dot(&v) / distance);
             let lever = along / at.radius_mm;
@@ -104,6 +120,7 @@ impl Sums {
             sums.right -= row * (weight * residual);
             sums.weight += weight;
             sums.square += weight * residual * residual;
+            sums.normals += across * (weight / distance);
             sums.count += 1;
         }
         sums.normal.fill_upper_triangle_with_lower_triangle();
@@ -155,13 +172,7 @@ mod tests {
             let axis = Vector3::new(ax, ay, 1.0).normalize();
             let points = half_cylinder(&centre, &axis, radius);
             let (u, v) = across(&axis);
-            let start = Cylinder {
-                centre: centre + (u + v) * off * radius,
-                axis: (axis + u * tilt).normalize(),
-                radius_mm: radius * 1.04,
-                rms_mm: 0.0,
-                count: 0,
-            };
+            let start = Cylinder::guess(centre + (u + v) * off * radius, (axis + u * tilt).normalize(), radius * 1.04);
             let found = fit_cylinder(&points, &start, true).unwrap();
             prop_assert!((found.radius_mm - radius).abs() < 1e-4 * radius);
             prop_assert!(found.axis.cross(&axis).norm() < 1e-4);
@@ -173,13 +184,7 @@ mod tests {
     fn a_plane_is_no_cylinder() {
         let plane: Vec<_> =
             (0..400).map(|i| Point3::new((i % 20) as f64 * 0.1, (i / 20) as f64 * 0.1, 0.0)).collect();
-        let start = Cylinder {
-            centre: Point3::new(1.0, 1.0, -1.0),
-            axis: Vector3::x(),
-            radius_mm: 1.0,
-            rms_mm: 0.0,
-            count: 0,
-        };
+        let start = Cylinder::guess(Point3::new(1.0, 1.0, -1.0), Vector3::x(), 1.0);
         let found = fit_cylinder(&plane, &start, true);
         assert!(found.is_none_or(|c| c.count < 200), "{found:?}");
     }

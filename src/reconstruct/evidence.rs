@@ -5,6 +5,8 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 
 use super::model::TubeModel;
 use super::moments::Sample;
+use super::radius::median;
+use crate::tube::Spine;
 
 /// Sideways offset of the data at one place of the tube.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -17,6 +19,69 @@ pub struct Offset {
     pub chi2: f64,
 }
 
+/// Sectors around the tube that make patches with the stations along it.
+const SECTORS: usize = 8;
+
+/// Fewest points of a patch that tell its mean.
+const MIN_PATCH: usize = 5;
+
+/// Median of a squared standard normal variable.
+const MEDIAN_CHI2: f64 = 0.4549;
+
+/// A point as its place on the tube sees it.
+struct Seen {
+    station: usize,
+    /// Unit normal across the tube: y, z of the spine's frame.
+    normal: Vector2<f64>,
+    residual_mm: f64,
+}
+
+/// All points within the cut-off, by station.
+fn seen<'a>(
+    sample: &'a Sample,
+    model: &TubeModel,
+    spine: &'a Spine,
+    station_mm: f64,
+    cutoff_mm: f64,
+) -> impl Iterator<Item = Seen> + 'a {
+    let radius = model.tube_radius_mm;
+    sample.points.iter().zip(sample.segments()).filter_map(move |(p, segment)| {
+        let segment = &spine.segments()[*segment as usize];
+        let along = segment.closest_along_mm(p);
+        let local = segment.frame_at(along).inverse_transform_point(p);
+        let distance = local.y.hypot(local.z);
+        let residual_mm = distance - radius;
+        let station = ((segment.start_mm + along) / station_mm) as usize;
+        let normal = Vector2::new(local.y, local.z) / distance.max(1e-12);
+        (residual_mm.abs() <= cutoff_mm).then_some(Seen { station, normal, residual_mm })
+    })
+}
+
+/// By how much the residuals of a patch hang together: 1 for independent noise; n when a patch's mean varies n times
+/// more than its points' scatter explains, as it does where the tube is not quite round or straight or passes of the
+/// scanner disagree. A median, so that a local misfit does not count.
+pub fn correlation(
+    sample: &Sample,
+    model: &TubeModel,
+    station_mm: f64,
+    cutoff_mm: f64,
+    sigma_mm: f64,
+) -> f64 {
+    let spine = model.spine();
+    let count = (spine.length_mm() / station_mm) as usize + 1;
+    let mut patches = vec![(0usize, 0.0f64); count * SECTORS];
+    for point in seen(sample, model, &spine, station_mm, cutoff_mm) {
+        let turn = point.normal.y.atan2(point.normal.x) / std::f64::consts::TAU + 0.5;
+        let sector = ((turn * SECTORS as f64) as usize).min(SECTORS - 1);
+        let (n, sum) = &mut patches[point.station.min(count - 1) * SECTORS + sector];
+        *n += 1;
+        *sum += point.residual_mm;
+    }
+    let filled = patches.iter().filter(|(n, _)| *n >= MIN_PATCH);
+    let mut chi2: Vec<f64> = filled.map(|(n, sum)| sum * sum / (*n as f64 * sigma_mm * sigma_mm)).collect();
+    median(&mut chi2).map_or(1.0, |m| (m / MEDIAN_CHI2).max(1.0))
+}
+
 /// Offsets of all stations of the given length along the tube, from points within the cut-off.
 pub fn offsets(
     sample: &Sample,
@@ -26,22 +91,12 @@ pub fn offsets(
     sigma_mm: f64,
 ) -> Vec<Offset> {
     let spine = model.spine();
-    let count = (spine.length_mm() / station_mm).ceil().max(1.0) as usize;
+    let count = (spine.length_mm() / station_mm) as usize + 1;
     let mut sums = vec![(Matrix2::<f64>::zeros(), Vector2::<f64>::zeros()); count];
-    for (p, segment) in sample.points.iter().zip(sample.segments()) {
-        let segment = &spine.segments()[*segment as usize];
-        let along = segment.closest_along_mm(p);
-        let local = segment.frame_at(along).inverse_transform_point(p);
-        let distance = local.y.hypot(local.z);
-        let residual = distance - model.tube_radius_mm;
-        if residual.abs() > cutoff_mm || distance <= 0.0 {
-            continue;
-        }
-        let normal = Vector2::new(local.y, local.z) / distance;
-        let station = ((segment.start_mm + along) / station_mm) as usize;
-        let (matrix, right) = &mut sums[station.min(count - 1)];
-        *matrix += normal * normal.transpose();
-        *right += normal * residual;
+    for point in seen(sample, model, &spine, station_mm, cutoff_mm) {
+        let (matrix, right) = &mut sums[point.station.min(count - 1)];
+        *matrix += point.normal * point.normal.transpose();
+        *right += point.normal * point.residual_mm;
     }
     let offset = |(k, (matrix, right)): (usize, &(Matrix2<f64>, Vector2<f64>))| {
         // A narrow strip knows its offset across the strip only.

@@ -4,7 +4,7 @@
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-use super::cylinder::{Cylinder, SUPPORT_RADII, fit_cylinder};
+use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
 use super::radius::{JET_RADII, median};
 use crate::cloud::{Neighbours, PointCloud};
 use crate::recognize::{Jet, fit_jet};
@@ -20,6 +20,13 @@ const CURVATURE_SHARE: f64 = 0.1;
 
 /// Distance of a point from its spine point may differ from the radius by this share (same section).
 const RADIUS_SHARE: f64 = 0.1;
+
+/// A strip of surface narrower than about 50 degrees (see [`Cylinder::opening`]) tells no axis. On the inside of a
+/// tight bend both curvatures are about equal and the normal may point either way; this rule finds the wrong ones.
+const LEAST_OPENING: f64 = 0.06;
+
+/// Spine points with less than this share of the usual number of neighbours are strays.
+const LEAST_DENSITY: f64 = 0.2;
 
 /// One point near the spine with the direction of the tube there.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -71,43 +78,43 @@ fn project(
     radius_mm: f64,
     near: impl Fn(&Point3<f64>, f64) -> Vec<Point3<f64>>,
 ) -> Option<SpinePoint> {
-    let start = Cylinder {
-        centre: jet.foot - jet.normal * radius_mm,
-        axis: jet.weak_direction,
-        radius_mm,
-        rms_mm: 0.0,
-        count: 0,
-    };
-    let points = near(&start.centre, 1.3 * SUPPORT_RADII * radius_mm);
+    let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
+    let points = near(&start.centre, REACH_RADII * radius_mm);
     let cylinder = fit_cylinder(&points, &start, false)?;
     let distance = (p - cylinder.centre).norm();
-    let fits = (distance - radius_mm).abs() < RADIUS_SHARE * radius_mm;
+    let fits = (distance - radius_mm).abs() < RADIUS_SHARE * radius_mm && cylinder.opening > LEAST_OPENING;
     fits.then_some(SpinePoint { point: cylinder.centre, tangent: cylinder.axis })
 }
 
 /// Thins the spine cloud to points about `spacing_mm` apart, each moved sideways onto the mean of its
-/// neighbourhood; lonely points vanish.
+/// neighbourhood; strays vanish.
 pub fn condense(spine: &[SpinePoint], spacing_mm: f64) -> Vec<SpinePoint> {
     if spine.is_empty() {
         return Vec::new();
     }
     let points: Vec<Point3<f64>> = spine.iter().map(|s| s.point).collect();
     let neighbours = Neighbours::new(&PointCloud::from_points(&points));
+    let near = |i: usize| {
+        let mut found = Vec::new();
+        neighbours.within(&points[i], spacing_mm, &mut found);
+        found
+    };
+    let mut counts: Vec<f64> = (0..spine.len()).step_by(7).map(|i| near(i).len() as f64).collect();
+    let least = median(&mut counts).map_or(3.0, |usual| (LEAST_DENSITY * usual).max(3.0)) as usize;
     let mut taken = vec![false; spine.len()];
     let mut out = Vec::new();
-    let mut found = Vec::new();
     for i in 0..spine.len() {
         if taken[i] {
             continue;
         }
-        neighbours.within(&points[i], spacing_mm, &mut found);
+        let found = near(i);
         found.iter().for_each(|&k| taken[k as usize] = true);
         let along: Vec<&SpinePoint> = found
             .iter()
             .map(|&k| &spine[k as usize])
             .filter(|s| s.tangent.dot(&spine[i].tangent).abs() > 0.8)
             .collect();
-        if along.len() < 3 {
+        if along.len() < least {
             continue;
         }
         let n = along.len() as f64;

@@ -163,7 +163,7 @@ fn centre_line(cloud: &PointCloud, radius_mm: f64) -> Result<Vec<Point3<f64>>, R
     let spine = mls::spine_cloud(cloud, radius_mm);
     let condensed = mls::condense(&spine, spacing);
     let mut found = crust::connect(&condensed, spacing, radius_mm);
-    let lengths: Vec<f64> = found.chains.iter().map(|c| crust::length_mm(c)).collect();
+    let lengths: Vec<f64> = found.chains.iter().map(|c| crust::solid_length_mm(c, spacing)).collect();
     let longest = lengths.first().copied().unwrap_or(0.0);
     if longest < 2.0 * radius_mm {
         let wanted_mm = 0.2 * radius_mm;

@@ -4,7 +4,7 @@
 use nalgebra::Point3;
 use rayon::prelude::*;
 
-use super::cylinder::{Cylinder, SUPPORT_RADII, fit_cylinder};
+use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
 use crate::cloud::{Neighbours, PointCloud};
 use crate::recognize::{Jet, fit_jet};
 
@@ -103,15 +103,9 @@ fn refine(cloud: &PointCloud, radius_mm: f64) -> Option<f64> {
     let fitted: Vec<(f64, bool)> = jets
         .par_iter()
         .filter_map(|jet| {
-            let start = Cylinder {
-                centre: jet.foot - jet.normal * radius_mm,
-                axis: jet.weak_direction,
-                radius_mm,
-                rms_mm: 0.0,
-                count: 0,
-            };
+            let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
             let mut found = Vec::new();
-            neighbours.within(&start.centre, 1.3 * SUPPORT_RADII * radius_mm, &mut found);
+            neighbours.within(&start.centre, REACH_RADII * radius_mm, &mut found);
             let near: Vec<Point3<f64>> = found.iter().map(|&i| work.point(i as usize)).collect();
             let cylinder = fit_cylinder(&near, &start, true)?;
             let straight = (jet.weak_per_mm * radius_mm).abs() < 0.08;

@@ -57,12 +57,14 @@ struct Jury<'a> {
     sample: &'a [Point3<f64>],
     /// Noise by which misfits are judged.
     sigma_mm: f64,
+    /// How many points say one thing: misfits count only once per patch of surface where residuals hang together.
+    correlation: f64,
     prior: Option<RadiusPrior>,
 }
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -> Option<Candidate> {
-    let mut jury = Jury { sample, sigma_mm: 0.0, prior: None };
+    let mut jury = Jury { sample, sigma_mm: 0.0, correlation: 1.0, prior: None };
     let mut fits: Vec<Fit> = Vec::new();
     for tolerance in TOLERANCES {
         let kept: Vec<Point3<f64>> =
@@ -72,13 +74,13 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
         let model = TubeModel { start, lra, tube_radius_mm: radius_mm, common_radius: false };
         fits.push(jury.fit(&model));
     }
-    jury.sigma_mm = fits.iter().map(|f| f.sigma_mm).min_by(f64::total_cmp)?;
+    jury.calibrate(fits.iter().min_by(|a, b| a.sigma_mm.total_cmp(&b.sigma_mm))?);
     let best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&best.fit.model);
     let mut best = jury.judge(jury.fit(&best.fit.model));
     for _ in 0..ROUNDS {
         let Some(better) = jury.improve(&best) else { break };
-        jury.sigma_mm = jury.sigma_mm.min(better.fit.sigma_mm);
+        jury.calibrate(&better.fit);
         best = jury.judge(better.fit);
     }
     let common = jury.judge(jury.fit(&with_common_radius(&best.fit.model)));
@@ -94,9 +96,18 @@ impl Jury<'_> {
 
     fn judge(&self, fit: Fit) -> Candidate {
         let pass = Sample::new(self.sample.to_vec(), &fit.model).pass(&fit.model, 6.0 * self.sigma_mm);
-        let misfit = 2.0 * pass.cost / (self.sigma_mm * self.sigma_mm);
-        let score = misfit + fit.parameters.len() as f64 * (self.sample.len() as f64).ln();
+        let misfit = 2.0 * pass.cost / (self.sigma_mm * self.sigma_mm) / self.correlation;
+        let independent = self.sample.len() as f64 / self.correlation;
+        let score = misfit + fit.parameters.len() as f64 * independent.ln();
         Candidate { fit, score, prior: self.prior }
+    }
+
+    /// Takes noise and correlation from a fit.
+    fn calibrate(&mut self, fit: &Fit) {
+        let sample = Sample::new(self.sample.to_vec(), &fit.model);
+        let station = STATION_RADII * fit.model.tube_radius_mm;
+        self.sigma_mm = fit.sigma_mm;
+        self.correlation = evidence::correlation(&sample, &fit.model, station, fit.cutoff_mm, fit.sigma_mm);
     }
 
     /// The best of all changes by one bend, when it scores better.
@@ -119,7 +130,7 @@ impl Jury<'_> {
         let sample = Sample::new(self.sample.to_vec(), &fit.model);
         let station = STATION_RADII * fit.model.tube_radius_mm;
         let mut offsets = evidence::offsets(&sample, &fit.model, station, 4.0 * fit.cutoff_mm, self.sigma_mm);
-        offsets.retain(|o| o.chi2 > KINK_CHI2);
+        offsets.retain(|o| o.chi2 > KINK_CHI2 * self.correlation);
         offsets.sort_by(|a, b| b.chi2.total_cmp(&a.chi2).then(a.at_mm.total_cmp(&b.at_mm)));
         let mut out: Vec<(f64, Vector3<f64>)> = Vec::new();
         for o in offsets {

@@ -3,5 +3,7 @@
 pub mod bender;
 pub mod bender_server;
 mod forming;
+pub mod population;
+pub mod scan;
 
 pub use forming::{FormedTube, Plant};
