@@ -4,6 +4,7 @@
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
 mod convert;
+mod correct;
 mod inspect;
 mod reconstruct;
 
@@ -27,6 +28,8 @@ enum Command {
     Reconstruct(reconstruct::Args),
     /// Compares a measured tube with its part: deviations and verdict.
     Inspect(inspect::Args),
+    /// One step of the correction loop: from what was measured to the next table.
+    Correct(correct::Args),
     /// Converts bending tables between LRA, XYZ and YBC.
     Convert(convert::Args),
 }
@@ -70,6 +73,7 @@ pub fn main() -> ExitCode {
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Correct(args) => correct::run(&args),
         Command::Convert(args) => convert::run(&args),
     };
     match result {

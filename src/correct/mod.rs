@@ -1,1 +1,245 @@
-//! Deviations to the next bending table: spring-back, limits, verdicts.
+//! Deviations to the next bending table: spring-back, feeds, planes, limits, verdicts.
+//!
+//! Between `inspect` and `bender`. [`step`] is pure: history and knowledge in, one [`Answer`] out, nothing kept.
+//! The way through: [`history`] (the contract) -> [`replay`] (turn each scan round, learn from it: [`estimate`]
+//! angles, [`lengths`] feeds and planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
+//! limits) -> [`verdict`].
+
+mod belief;
+pub mod estimate;
+pub mod history;
+pub mod knowledge;
+pub mod lengths;
+pub mod plan;
+pub mod replay;
+mod rows;
+pub mod store;
+pub mod verdict;
+
+pub use history::{History, Part, SetUp};
+pub use knowledge::Knowledge;
+pub use plan::Limits;
+pub use verdict::{Answer, Code, Reason, Verdict};
+
+use crate::inspect::{self, Inspection};
+use crate::tube::{CommandTable, MeasuredTube, Nominal};
+use replay::{Newest, Replay, Used, replay};
+use rows::Rows;
+
+/// One step of the loop: what the history says, and the table to bend with next.
+pub fn step(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
+    let rows = Rows::of(nominal);
+    let (bent, merged) = (rows.merged(nominal), rows.merge(history));
+    rows.expand(step_of_bends(&bent, &merged, knowledge, limits))
+}
+
+/// What was known with what this job showed put in; a job replaces its own earlier record.
+pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge) -> Knowledge {
+    let rows = Rows::of(nominal);
+    let (nominal, history) = (rows.merged(nominal), rows.merge(history));
+    let mut out = knowledge.clone();
+    if same_scan(&history).is_none() {
+        let replay = replay(&nominal, &history, knowledge, false);
+        if let Some(record) = knowledge::record(&nominal, &history, &replay.used) {
+            out.put(&knowledge::Key::of(&nominal, &history.key), record);
+        }
+    }
+    out
+}
+
+/// For tables without rows of angle 0.
+fn step_of_bends(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
+    let replay = replay(nominal, history, knowledge, false);
+    let decided = decide(nominal, history, &replay, limits);
+    let Newest::Used { ambiguous: true, .. } = replay.newest else { return decided };
+    let other = self::replay(nominal, history, knowledge, true);
+    let turned = decide(nominal, history, &other, limits);
+    if matters(&decided, &turned, nominal) {
+        let text = "the scan fits the part from both ends, and the next table depends on which it was: mark the \
+                    first end and scan again";
+        return held(nominal, history, &replay, vec![Reason::new(Code::Direction, text)]);
+    }
+    decided
+}
+
+fn decide(nominal: &Nominal, history: &History, replay: &Replay, limits: &Limits) -> Answer {
+    if let Some(reason) = same_scan(history) {
+        return held(nominal, history, replay, vec![reason]);
+    }
+    match &replay.newest {
+        Newest::None => first_piece(nominal, history, replay, limits),
+        Newest::Refused(reason) => held(nominal, history, replay, vec![reason.clone()]),
+        Newest::Used { outliers, .. } => {
+            let Some(newest) = replay.used.last() else {
+                return first_piece(nominal, history, replay, limits);
+            };
+            let doubts = doubts(nominal, newest, outliers);
+            if !doubts.is_empty() {
+                return answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts);
+            }
+            judged(nominal, history, replay, newest, limits)
+        }
+    }
+}
+
+fn first_piece(nominal: &Nominal, history: &History, replay: &Replay, limits: &Limits) -> Answer {
+    let mut table = plan::first(&replay.model, nominal);
+    plan::clamp(&mut table, limits);
+    let violations = plan::violations(&table, nominal, limits);
+    if !violations.is_empty() {
+        return held(nominal, history, replay, violations);
+    }
+    answer(Verdict::FirstPiece, table, replay, Vec::new())
+}
+
+/// The newest part is a fair measurement of this part: good, to correct, or past correcting.
+fn judged(nominal: &Nominal, history: &History, replay: &Replay, newest: &Used, limits: &Limits) -> Answer {
+    let in_force = newest.commanded.clone();
+    let seen = |measured: &MeasuredTube| inspect::inspect(measured, nominal);
+    let (whole, inspection) = match (seen(&newest.measured), seen(&trimmed(&newest.measured, nominal))) {
+        (Ok(whole), Ok(trimmed)) => (whole, trimmed),
+        (Err(e), _) | (_, Err(e)) => {
+            return held(nominal, history, replay, vec![Reason::new(Code::Unusable, e.to_string())]);
+        }
+    };
+    let cut = cut_length(&whole, nominal, history);
+    let mut reasons: Vec<Reason> = cut.into_iter().collect();
+    match inspection.verdict {
+        inspect::Verdict::WrongHand => {
+            return held(nominal, history, replay, vec![Reason::new(Code::WrongHand, inspection.advice)]);
+        }
+        inspect::Verdict::WrongPart => {
+            return held(nominal, history, replay, vec![Reason::new(Code::WrongPart, inspection.advice)]);
+        }
+        inspect::Verdict::InTolerance => {
+            return answer(Verdict::InTolerance, in_force, replay, reasons);
+        }
+        inspect::Verdict::OutOfTolerance | inspect::Verdict::Uncertain => {}
+    }
+    let (table, changes) = plan::next(&replay.model, nominal, newest, limits);
+    let violations = plan::violations(&table, nominal, limits);
+    if !violations.is_empty() {
+        return held(nominal, history, replay, violations);
+    }
+    reasons.extend(changes);
+    if table != in_force {
+        return answer(Verdict::Correct, table, replay, reasons);
+    }
+    if inspection.verdict == inspect::Verdict::Uncertain {
+        reasons.push(Reason::new(Code::Unseen, inspection.advice));
+        return answer(Verdict::Rescan, in_force, replay, reasons);
+    }
+    let text = format!("{} (the table stays: by all parts so far this is scatter)", inspection.advice);
+    reasons.push(Reason::new(Code::Scatter, text));
+    answer(Verdict::Correct, in_force, replay, reasons)
+}
+
+/// Measurements that nothing should be concluded from: too uncertain, or unlike this bend's others.
+fn doubts(nominal: &Nominal, newest: &Used, outliers: &[estimate::Outlier]) -> Vec<Reason> {
+    let deg = f64::to_degrees;
+    let tolerance = nominal.tolerance.angle_rad;
+    let bends = newest.measured.bends.iter().enumerate();
+    let uncertain = bends.filter(|(_, b)| 2.0 * b.angle_sigma_rad > tolerance).map(|(i, b)| {
+        let text = format!(
+            "angle {} is known to +-{:.2} degrees (one sigma) only, tolerance is {:.2}: scan both its straights again",
+            i + 1,
+            deg(b.angle_sigma_rad),
+            deg(tolerance)
+        );
+        Reason::at(Code::TooUncertain, i, text)
+    });
+    let odd = outliers.iter().map(|o| {
+        let text = format!(
+            "bend {}: spring-back {:.2} degrees where {:.2} +-{:.2} is expected: scan again; if it stays, look at clamp and mandrel",
+            o.bend + 1,
+            deg(o.found_rad),
+            deg(o.expected_rad.value),
+            deg(o.expected_rad.sigma)
+        );
+        Reason::at(Code::Outlier, o.bend, text)
+    });
+    uncertain.chain(odd).collect()
+}
+
+/// The same tube with its last straight as long as wanted: that end is the cut length's matter.
+fn trimmed(measured: &MeasuredTube, nominal: &Nominal) -> MeasuredTube {
+    let mut out = measured.clone();
+    let n = nominal.lra.bends.len();
+    let wanted = nominal.lra.last_length_mm;
+    let corner = inspect::corners(measured, &nominal.lra);
+    out.last_length_mm = Some(wanted);
+    out.last_length_sigma_mm = Some(0.0);
+    if let (Some(last), Some(true)) = (nominal.lra.bends.last(), corner.last()) {
+        // By its corner distance, so that the formed radius does not matter.
+        let tangent = last.radius_mm * (measured.bends[n - 1].angle_rad / 2.0).tan();
+        out.intersection_mm.resize(n + 1, None);
+        out.intersection_sigma_mm.resize(n + 1, None);
+        out.intersection_mm[n] = Some(wanted + tangent);
+        out.intersection_sigma_mm[n] = Some(0.0);
+    }
+    out
+}
+
+fn cut_length(whole: &Inspection, nominal: &Nominal, history: &History) -> Option<Reason> {
+    let last = whole.last_length_mm?;
+    let off = last.deviation?;
+    if off.abs() <= nominal.tolerance.length_mm {
+        return None;
+    }
+    let how = if off < 0.0 { "longer" } else { "shorter" };
+    let cut = history.parts.last().and_then(|p| p.cut_length_mm);
+    let figure = cut.map_or(String::new(), |c| format!(" ({:.1} mm)", c - off));
+    let text = format!(
+        "the last straight is {:.2} mm instead of {:.2}: cut the tube {:.2} mm {how}{figure}, no feed corrects that",
+        last.nominal + off,
+        last.nominal,
+        off.abs()
+    );
+    Some(Reason::new(Code::CutLength, text))
+}
+
+fn same_scan(history: &History) -> Option<Reason> {
+    for (i, part) in history.parts.iter().enumerate() {
+        for (k, earlier) in history.parts[..i].iter().enumerate() {
+            if let Some(id) = part.scan_identities().find(|id| earlier.scan_identities().any(|e| e == *id)) {
+                let text =
+                    format!("parts {} and {} are the same scan ({id}): one scan per part", k + 1, i + 1);
+                return Some(Reason::new(Code::SameScan, text));
+            }
+        }
+    }
+    None
+}
+
+/// Whether two answers differ by more than half a tolerance anywhere, or in verdict.
+fn matters(a: &Answer, b: &Answer, nominal: &Nominal) -> bool {
+    let tolerance = &nominal.tolerance;
+    let both = a.commanded.bends.iter().zip(&b.commanded.bends);
+    let differs = |(a, b): (&crate::tube::CommandRow, &crate::tube::CommandRow)| {
+        (a.angle_rad - b.angle_rad).abs() > tolerance.angle_rad / 2.0
+            || (a.rotation_rad - b.rotation_rad).abs() > tolerance.rotation_rad / 2.0
+            || (a.length_mm - b.length_mm).abs() > tolerance.length_mm / 2.0
+    };
+    let stops = |a: &Answer| matches!(a.verdict, Verdict::Rescan | Verdict::Hold);
+    stops(a) != stops(b) || both.into_iter().any(differs)
+}
+
+fn held(nominal: &Nominal, history: &History, replay: &Replay, reasons: Vec<Reason>) -> Answer {
+    let in_force = history.parts.last().map(|p| p.commanded.clone());
+    let table = in_force.unwrap_or_else(|| CommandTable::from_lra(&nominal.lra));
+    answer(Verdict::Hold, table, replay, reasons)
+}
+
+fn answer(verdict: Verdict, commanded: CommandTable, replay: &Replay, reasons: Vec<Reason>) -> Answer {
+    // A table of another program has more or fewer rows than there is belief about.
+    let bends = commanded.bends.iter().take(replay.model.springback.bends()).enumerate();
+    let next: Vec<_> = bends.map(|(i, row)| replay.model.springback.next_at(i, row.angle_rad)).collect();
+    let clean = crate::tube::deg::to_degrees_clean;
+    Answer {
+        verdict,
+        springback_deg: next.iter().map(|k| clean(k.value)).collect(),
+        springback_sigma_deg: next.iter().map(|k| clean(k.sigma)).collect(),
+        commanded,
+        reasons: reasons.into_iter().chain(replay.left_out.iter().cloned()).collect(),
+    }
+}

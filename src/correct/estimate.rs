@@ -1,0 +1,208 @@
+//! How much each bend springs back: a prior from the material, blended with what was measured.
+//!
+//! Law: s(c) = s90 (x1 + x2 c/90 + x3 sqrt(c/90)) + r, in degrees of the commanded angle c. x is shared by all
+//! bends of the key, r is each bend's own residual in this program. The basis fits published finite-element
+//! curves far better than a straight line (field notes). Every measurement is weighed with its variance, so a
+//! doubtful one moves little: no further damping is needed.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::belief::Belief;
+use super::knowledge::JobRecord;
+use crate::inspect::Known;
+use crate::tube::{Material, Nominal};
+
+const DEGREE: f64 = std::f64::consts::PI / 180.0;
+
+/// Prior of x and its sigma (field: .3 .4 .3, each to a quarter).
+const SHAPE: [f64; 3] = [0.3, 0.4, 0.3];
+const SHAPE_SIGMA: f64 = 0.25;
+/// Prior sigma of a bend's residual.
+const RESIDUAL_SIGMA_RAD: f64 = 0.15 * DEGREE;
+/// Scatter from bend to bend that no table can take out.
+const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
+/// Scatter from tube to tube, common to its bends, as a share of the spring-back.
+const TUBE_SCATTER: f64 = 0.015;
+/// Drift of x from part to part: without it the filter stays stuck after a change of material.
+const DRIFT: f64 = 0.02;
+/// Common scale of another job's spring-back: of the same batch, of another or an unknown one.
+const SAME_BATCH: f64 = 0.02;
+const OTHER_BATCH: f64 = 0.10;
+/// Gate on |innovation| in sigmas: from the first on a measurement counts less, from the second not at all.
+const DOUBT: f64 = 3.0;
+const REJECT: f64 = 6.0;
+
+/// The belief about one job's spring-back.
+#[derive(Debug, Clone)]
+pub struct Springback {
+    belief: Belief,
+    /// Usual spring-back of a 90 degree bend, per bend (its radius matters).
+    s90_rad: Vec<f64>,
+    /// Bends whose last measurement was rejected: the next like it is believed.
+    suspect: Vec<bool>,
+    /// Sigma of each bend's innovation when the last part came in.
+    surprise_sigma_rad: Vec<f64>,
+}
+
+/// A measured angle that does not fit what the job showed before.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outlier {
+    /// Bend, from 0.
+    pub bend: usize,
+    /// Spring-back found.
+    pub found_rad: f64,
+    /// Spring-back expected, with the sigma of finding another.
+    pub expected_rad: Known,
+}
+
+impl Springback {
+    /// What is believed before the job's first part. `batch` tells whose tubes the records are.
+    pub fn prior(nominal: &Nominal, records: &[&JobRecord], batch: Option<&str>) -> Springback {
+        let n = nominal.lra.bends.len();
+        let s90_rad = nominal.lra.bends.iter().map(|b| usual_springback(nominal, b.radius_mm)).collect();
+        let mut unknowns: Vec<Known> = SHAPE.map(|value| Known { value, sigma: SHAPE_SIGMA }).to_vec();
+        unknowns.extend(vec![Known { value: 0.0, sigma: RESIDUAL_SIGMA_RAD }; n]);
+        let mut out = Springback {
+            belief: Belief::new(&unknowns),
+            s90_rad,
+            suspect: vec![false; n],
+            surprise_sigma_rad: vec![0.0; n],
+        };
+        for record in records {
+            let same = batch.is_some() && record.batch.as_deref() == batch;
+            out.recall(nominal, record, if same { SAME_BATCH } else { OTHER_BATCH });
+        }
+        out
+    }
+
+    /// Takes in another job of this key: its bends carry residuals of their own and a common scale.
+    fn recall(&mut self, nominal: &Nominal, record: &JobRecord, common: f64) {
+        let points = &record.bends;
+        let row = |p: &super::knowledge::BendPoint| {
+            self.shape_row(usual_springback(nominal, p.radius_mm), p.commanded_rad)
+        };
+        let rows: Vec<DVector<f64>> = points.iter().map(row).collect();
+        let values: Vec<f64> = points.iter().map(|p| p.springback_rad).collect();
+        let mut noise = common_noise(&values, common);
+        for (i, p) in points.iter().enumerate() {
+            noise[(i, i)] += p.sigma_rad.powi(2) + RESIDUAL_SIGMA_RAD.powi(2);
+        }
+        self.belief.update(&rows, &values, &noise);
+    }
+
+    /// Takes in one part: commanded and measured angle per bend. Answers with what was rejected.
+    pub fn learn(&mut self, commanded_rad: &[f64], measured: &[Known]) -> Vec<Outlier> {
+        (0..SHAPE.len()).for_each(|k| self.belief.loosen(k, DRIFT));
+        let (mut rows, mut values, mut variances) = (Vec::new(), Vec::new(), Vec::new());
+        let mut outliers = Vec::new();
+        for (i, (c, m)) in commanded_rad.iter().zip(measured).enumerate() {
+            let expected_rad = self.measured_at(i, *c, m.sigma);
+            let found_rad = c - m.value;
+            let off = (found_rad - expected_rad.value).abs() / expected_rad.sigma;
+            self.surprise_sigma_rad[i] = expected_rad.sigma;
+            let mut variance = BEND_SCATTER_RAD.powi(2) + m.sigma.powi(2);
+            if off > REJECT && !self.suspect[i] {
+                self.suspect[i] = true;
+                outliers.push(Outlier { bend: i, found_rad, expected_rad });
+                continue;
+            }
+            if off > REJECT {
+                // Twice in a row is no outlier: this bend has changed.
+                self.belief.loosen(SHAPE.len() + i, found_rad - expected_rad.value);
+            } else if off > DOUBT {
+                variance += expected_rad.sigma.powi(2) * ((off / DOUBT).powi(2) - 1.0);
+            }
+            self.suspect[i] = off > REJECT;
+            rows.push(self.row(i, *c));
+            values.push(found_rad);
+            variances.push(variance);
+        }
+        let mut noise = common_noise(&values, TUBE_SCATTER);
+        variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
+        self.belief.update(&rows, &values, &noise);
+        outliers
+    }
+
+    /// Spring-back of a bend at a commanded angle, never negative, with the sigma of the estimate.
+    pub fn at(&self, bend: usize, commanded_rad: f64) -> Known {
+        let found = self.belief.predict(&self.row(bend, commanded_rad));
+        Known { value: found.value.clamp(0.0, commanded_rad.max(0.0)), ..found }
+    }
+
+    /// The same with the scatter of the next tube in the sigma.
+    pub fn next_at(&self, bend: usize, commanded_rad: f64) -> Known {
+        self.measured_at(bend, commanded_rad, 0.0)
+    }
+
+    /// The angle to command for a wanted one: the fixed point c = wanted + s(c), held where the law would be
+    /// steeper than metal is (gain of formed over commanded angle in [0.8, 1.02]).
+    pub fn command_for(&self, bend: usize, wanted_rad: f64) -> f64 {
+        let mut c = wanted_rad;
+        for _ in 0..60 {
+            let next = wanted_rad + self.at(bend, c).value;
+            if (next - c).abs() < 1e-12 {
+                break;
+            }
+            // A contraction by at most 0.2 converges to 1e-12 within 20 rounds; half steps tame the rest.
+            c = if (next - c).abs() > 0.2 * c.max(0.02) { (c + next) / 2.0 } else { next };
+        }
+        c
+    }
+
+    /// Sigma of a bend's innovation when the last part came in: what a correction may have to move.
+    pub fn surprise_sigma_rad(&self, bend: usize) -> f64 {
+        self.surprise_sigma_rad[bend]
+    }
+
+    /// Number of bends.
+    pub fn bends(&self) -> usize {
+        self.s90_rad.len()
+    }
+
+    fn measured_at(&self, bend: usize, commanded_rad: f64, sigma: f64) -> Known {
+        let found = self.at(bend, commanded_rad);
+        let scatter = BEND_SCATTER_RAD.hypot(TUBE_SCATTER * found.value);
+        Known { value: found.value, sigma: found.sigma.hypot(scatter).hypot(sigma) }
+    }
+
+    fn row(&self, bend: usize, commanded_rad: f64) -> DVector<f64> {
+        let mut row = self.shape_row(self.s90_rad[bend], commanded_rad);
+        row[SHAPE.len() + bend] = 1.0;
+        row
+    }
+
+    fn shape_row(&self, s90_rad: f64, commanded_rad: f64) -> DVector<f64> {
+        let mut row = DVector::zeros(self.belief.len());
+        let share = (commanded_rad / (90.0 * DEGREE)).max(0.0);
+        row.rows_mut(0, 3).copy_from_slice(&[s90_rad, s90_rad * share, s90_rad * share.sqrt()]);
+        row
+    }
+}
+
+fn common_noise(values: &[f64], share: f64) -> DMatrix<f64> {
+    let column = DVector::from_column_slice(values) * share;
+    &column * column.transpose()
+}
+
+/// Spring-back of a 90 degree bend: the material's usual one, moved by what the beam formula says of this
+/// radius against the usual one's 2 D.
+fn usual_springback(nominal: &Nominal, radius_mm: f64) -> f64 {
+    let elastic = |radius_mm: f64| {
+        90.0 * DEGREE * elastic_share(&nominal.material, nominal.od_mm, nominal.wall_mm, radius_mm)
+    };
+    let usual_radius_mm = 2.0 * nominal.od_mm;
+    let moved = nominal.material.usual_springback_rad + elastic(radius_mm) - elastic(usual_radius_mm);
+    moved.max(0.3 * DEGREE)
+}
+
+/// Elastic share of a bend angle, eta = M R / (E I), for a thin-walled tube bent fully plastic in a material
+/// that hardens as K eps^n: (4/pi) (K/E) (R/r)^(1-n) times the section's integral of sin^(1+n), which runs
+/// nearly straight from 1 (n = 0) to pi/4 (n = 1).
+fn elastic_share(material: &Material, od_mm: f64, wall_mm: f64, radius_mm: f64) -> f64 {
+    use std::f64::consts::FRAC_PI_4;
+    let n = material.hardening_exponent;
+    let middle_mm = (od_mm - wall_mm) / 2.0;
+    let section = 1.0 - (1.0 - FRAC_PI_4) * n;
+    let modulus = material.strength_coefficient_mpa / material.youngs_modulus_mpa;
+    modulus * (radius_mm / middle_mm).powf(1.0 - n) * section / FRAC_PI_4
+}

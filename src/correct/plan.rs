@@ -1,0 +1,233 @@
+//! From belief to table: dead band, step limit, total limit, the machine's range.
+
+use super::replay::{Model, Used};
+use super::verdict::{Code, Reason};
+use crate::inspect::{corners, distances, rotation};
+use crate::tube::{CommandTable, MachineLimits, Nominal, wrap_angle};
+
+const DEGREE: f64 = std::f64::consts::PI / 180.0;
+
+/// What a correction may do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Limits {
+    /// Range of the machine.
+    pub machine: MachineLimits,
+    /// Most that one part may change an angle, or three sigmas of what was expected if that is more.
+    pub step_angle_rad: f64,
+    /// The same for a feed.
+    pub step_length_mm: f64,
+    /// The same for a rotation.
+    pub step_rotation_rad: f64,
+    /// Farthest that an angle may go from the nominal.
+    pub total_angle_rad: f64,
+    /// The same for a feed.
+    pub total_length_mm: f64,
+    /// The same for a rotation.
+    pub total_rotation_rad: f64,
+}
+
+impl Default for Limits {
+    /// No machine known: 2 degrees and 5 mm per part, 15 degrees and 20 mm in all, rotations 2 and 5 degrees.
+    fn default() -> Limits {
+        Limits {
+            machine: MachineLimits::unlimited(),
+            step_angle_rad: 2.0 * DEGREE,
+            step_length_mm: 5.0,
+            step_rotation_rad: 2.0 * DEGREE,
+            total_angle_rad: 15.0 * DEGREE,
+            total_length_mm: 20.0,
+            total_rotation_rad: 5.0 * DEGREE,
+        }
+    }
+}
+
+/// One value's change: what stands in the table, what is wanted, and by how much it may move.
+struct Change {
+    current: f64,
+    wanted: f64,
+    dead_band: f64,
+    step: f64,
+}
+
+impl Change {
+    /// The new value, and whether the step limit cut it; None within the dead band.
+    fn apply(&self) -> Option<(f64, bool)> {
+        let change = self.wanted - self.current;
+        (change.abs() > self.dead_band)
+            .then(|| (self.current + change.clamp(-self.step, self.step), change.abs() > self.step))
+    }
+}
+
+/// The table to bend with before anything was measured.
+pub fn first(model: &Model, nominal: &Nominal) -> CommandTable {
+    let mut table = CommandTable::from_lra(&nominal.lra);
+    for (i, row) in table.bends.iter_mut().enumerate() {
+        row.angle_rad = model.springback.command_for(i, row.angle_rad);
+        row.rotation_rad = model.rotations.command_for(i, row.rotation_rad);
+    }
+    let angles: Vec<f64> = table.bends.iter().map(|r| r.angle_rad).collect();
+    for (i, row) in table.bends.iter_mut().enumerate() {
+        row.length_mm = model.lengths.command_for(i, &angles);
+    }
+    table
+}
+
+/// The next table after `newest`, and what changes and why. The table in force itself when nothing does.
+pub fn next(model: &Model, nominal: &Nominal, newest: &Used, limits: &Limits) -> (CommandTable, Vec<Reason>) {
+    let mut plan =
+        Plan { model, nominal, newest, limits, table: newest.commanded.clone(), reasons: Vec::new() };
+    (0..nominal.lra.bends.len()).for_each(|i| plan.angle(i));
+    (0..nominal.lra.bends.len()).for_each(|i| plan.rotation(i));
+    plan.lengths();
+    (plan.table, plan.reasons)
+}
+
+struct Plan<'a> {
+    model: &'a Model,
+    nominal: &'a Nominal,
+    newest: &'a Used,
+    limits: &'a Limits,
+    table: CommandTable,
+    reasons: Vec<Reason>,
+}
+
+impl Plan<'_> {
+    fn angle(&mut self, i: usize) {
+        let wanted = self.nominal.lra.bends[i].angle_rad;
+        let measured = &self.newest.measured.bends[i];
+        let change = Change {
+            current: self.table.bends[i].angle_rad,
+            wanted: self.model.springback.command_for(i, wanted),
+            dead_band: dead_band(self.nominal.tolerance.angle_rad, measured.angle_sigma_rad),
+            step: self.limits.step_angle_rad.max(3.0 * self.model.springback.surprise_sigma_rad(i)),
+        };
+        let Some((value, cut)) = change.apply() else { return };
+        self.table.bends[i].angle_rad = value;
+        let deg = f64::to_degrees;
+        let text = format!(
+            "angle {}: measured {:.2} instead of {:.2} degrees: command {:.2}, was {:.2}",
+            i + 1,
+            deg(measured.angle_rad),
+            deg(wanted),
+            deg(value),
+            deg(change.current)
+        );
+        self.reasons.push(Reason::at(Code::Angle, i, text));
+        self.cut(cut, i, "angle", deg(change.wanted - change.current), deg(change.step), "degrees");
+    }
+
+    fn rotation(&mut self, i: usize) {
+        let tolerance = self.nominal.tolerance.rotation_rad;
+        let Some(found) = rotation(&self.newest.measured, i).filter(|r| r.sigma <= tolerance / 2.0) else {
+            return;
+        };
+        let wanted = self.nominal.lra.bends[i].rotation_rad;
+        let current = self.table.bends[i].rotation_rad;
+        let change = Change {
+            current,
+            wanted: current + wrap_angle(self.model.rotations.command_for(i, wanted) - current),
+            dead_band: dead_band(tolerance, found.sigma),
+            step: self.limits.step_rotation_rad,
+        };
+        let Some((value, cut)) = change.apply() else { return };
+        self.table.bends[i].rotation_rad = value;
+        let deg = f64::to_degrees;
+        let text = format!(
+            "rotation {}: measured {:.2} instead of {:.2} degrees: command {:.2}, was {:.2}",
+            i + 1,
+            deg(wanted + wrap_angle(found.value - wanted)),
+            deg(wanted),
+            deg(value),
+            deg(current)
+        );
+        self.reasons.push(Reason::at(Code::Rotation, i, text));
+        self.cut(cut, i, "rotation", deg(change.wanted - current), deg(change.step), "degrees");
+    }
+
+    fn lengths(&mut self) {
+        let angles: Vec<f64> = self.table.bends.iter().map(|r| r.angle_rad).collect();
+        let corner = corners(&self.newest.measured, &self.nominal.lra);
+        let found = distances(&self.newest.measured, &corner);
+        for (i, found) in found.iter().enumerate().take(angles.len()) {
+            let change = Change {
+                current: self.table.bends[i].length_mm,
+                wanted: self.model.lengths.command_for(i, &angles),
+                dead_band: dead_band(self.nominal.tolerance.length_mm, found.map_or(0.0, |f| f.sigma)),
+                step: self.limits.step_length_mm.max(3.0 * self.model.lengths.surprise_sigma_mm(i)),
+            };
+            let Some((value, cut)) = change.apply() else { continue };
+            let shortest = shortest_feed(&self.limits.machine, i);
+            let held = value.max(shortest);
+            if value < shortest {
+                let text = format!("feed {}: {value:.2} mm wanted, {shortest:.2} is the shortest", i + 1);
+                self.reasons.push(Reason::at(Code::Clamped, i, text));
+            }
+            if held == change.current {
+                continue;
+            }
+            self.table.bends[i].length_mm = held;
+            let text = format!("feed {}: {held:.2} mm, was {:.2}", i + 1, change.current);
+            self.reasons.push(Reason::at(Code::Length, i, text));
+            self.cut(cut, i, "feed", change.wanted - change.current, change.step, "mm");
+        }
+    }
+
+    fn cut(&mut self, cut: bool, i: usize, what: &str, wanted: f64, step: f64, unit: &str) {
+        if cut {
+            let text = format!("{what} {}: change of {wanted:+.2} cut to {step:.2} {unit}", i + 1);
+            self.reasons.push(Reason::at(Code::StepLimit, i, text));
+        }
+    }
+}
+
+fn shortest_feed(machine: &MachineLimits, i: usize) -> f64 {
+    if i == 0 { machine.min_first_length_mm } else { machine.min_between_mm }
+}
+
+/// Changes smaller than this chase noise (field: a quarter of the tolerance or 1.5 sigma).
+fn dead_band(tolerance: f64, sigma: f64) -> f64 {
+    (0.25 * tolerance).max(1.5 * sigma)
+}
+
+/// Feeds that the machine cannot make so short are held at its shortest; for the first piece.
+pub fn clamp(table: &mut CommandTable, limits: &Limits) {
+    for (i, row) in table.bends.iter_mut().enumerate() {
+        row.length_mm = row.length_mm.max(shortest_feed(&limits.machine, i));
+    }
+}
+
+/// What in a table goes too far from the nominal or leaves the machine's range.
+pub fn violations(table: &CommandTable, nominal: &Nominal, limits: &Limits) -> Vec<Reason> {
+    let mut out = Vec::new();
+    let machine = &limits.machine;
+    if table.bends.len() > machine.max_bends {
+        let text = format!("{} bends, the machine holds {}", table.bends.len(), machine.max_bends);
+        out.push(Reason::new(Code::MachineLimit, text));
+    }
+    let deg = f64::to_degrees;
+    for (i, (row, wanted)) in table.bends.iter().zip(&nominal.lra.bends).enumerate() {
+        let turn = wrap_angle(row.rotation_rad - wanted.rotation_rad);
+        let total = [
+            ("angle", deg(row.angle_rad - wanted.angle_rad), deg(limits.total_angle_rad), "degrees"),
+            ("rotation", deg(turn), deg(limits.total_rotation_rad), "degrees"),
+            ("feed", row.length_mm - wanted.length_mm, limits.total_length_mm, "mm"),
+        ];
+        for (what, off, most, unit) in total.into_iter().filter(|(_, off, most, _)| off.abs() > *most) {
+            let text = format!(
+                "{what} {} would go {off:+.2} {unit} from the nominal, allowed is {most:.2}: check die, material, set-up",
+                i + 1
+            );
+            out.push(Reason::at(Code::TotalLimit, i, text));
+        }
+        let range = [
+            ("angle", deg(row.angle_rad), deg(machine.max_angle_rad), "degrees"),
+            ("rotation", deg(row.rotation_rad).abs(), deg(machine.max_rotation_rad), "degrees"),
+            ("feed", row.length_mm, machine.max_length_mm, "mm"),
+        ];
+        for (what, value, most, unit) in range.into_iter().filter(|(_, value, most, _)| value > most) {
+            let text = format!("{what} {} would be {value:.2} {unit}, the machine goes to {most:.2}", i + 1);
+            out.push(Reason::at(Code::MachineLimit, i, text));
+        }
+    }
+    out
+}

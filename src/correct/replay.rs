@@ -1,0 +1,153 @@
+//! Replays a job's history into what is believed now: every part turned to the nominal's direction, checked,
+//! learned from. No state is kept between steps: the same history gives the same belief.
+
+use super::estimate::{Outlier, Springback};
+use super::history::{History, Part};
+use super::knowledge::{Key, Knowledge};
+use super::lengths::{Lengths, Rotations};
+use super::verdict::{Code, Reason};
+use crate::inspect::{self, Known};
+use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
+
+/// A part that taught something.
+#[derive(Debug, Clone)]
+pub struct Used {
+    /// Its table.
+    pub commanded: CommandTable,
+    /// Its measurement in the nominal's direction.
+    pub measured: MeasuredTube,
+    /// Bends whose angle was rejected.
+    pub outliers: Vec<usize>,
+}
+
+/// Beliefs of one job.
+#[derive(Debug, Clone)]
+pub struct Model {
+    /// Angles.
+    pub springback: Springback,
+    /// Feeds.
+    pub lengths: Lengths,
+    /// Planes.
+    pub rotations: Rotations,
+}
+
+/// The history worked through.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    /// What is believed now.
+    pub model: Model,
+    /// The parts that were learned from, oldest first.
+    pub used: Vec<Used>,
+    /// What became of the newest part.
+    pub newest: Newest,
+    /// Earlier parts left out, and why.
+    pub left_out: Vec<Reason>,
+}
+
+/// The newest part.
+#[derive(Debug, Clone)]
+pub enum Newest {
+    /// There is none yet.
+    None,
+    /// It was learned from (the last of `used`).
+    Used {
+        /// Its other direction fits nearly as well.
+        ambiguous: bool,
+        /// Bends rejected.
+        outliers: Vec<Outlier>,
+    },
+    /// It is no tube to learn from.
+    Refused(Reason),
+}
+
+/// Works the history through. `turn_newest` reads the newest part against the better direction.
+pub fn replay(nominal: &Nominal, history: &History, knowledge: &Knowledge, turn_newest: bool) -> Replay {
+    let key = Key::of(nominal, &history.key);
+    let records = knowledge.of_others(&key, history.job_id(nominal).as_deref());
+    let model = Model {
+        springback: Springback::prior(nominal, &records, history.batch.as_deref()),
+        lengths: Lengths::prior(&nominal.lra, &records),
+        rotations: Rotations::prior(nominal.lra.bends.len()),
+    };
+    let mut out = Replay { model, used: Vec::new(), newest: Newest::None, left_out: Vec::new() };
+    for (i, part) in history.parts.iter().enumerate() {
+        let newest = i + 1 == history.parts.len();
+        match oriented(nominal, part, &out.model, newest && turn_newest) {
+            Ok((measured, ambiguous)) => {
+                let outliers = out.model.learn(nominal, &part.commanded, &measured);
+                let rejected = outliers.iter().map(|o| o.bend).collect();
+                out.used.push(Used { commanded: part.commanded.clone(), measured, outliers: rejected });
+                out.newest = Newest::Used { ambiguous, outliers };
+            }
+            Err(reason) if newest => out.newest = Newest::Refused(reason),
+            Err(reason) => {
+                let text = format!("part {} of the history was left out: {}", i + 1, reason.text);
+                out.left_out.push(Reason::new(Code::LeftOut, text));
+            }
+        }
+    }
+    out
+}
+
+impl Model {
+    fn learn(
+        &mut self,
+        nominal: &Nominal,
+        commanded: &CommandTable,
+        measured: &MeasuredTube,
+    ) -> Vec<Outlier> {
+        let angles: Vec<f64> = commanded.bends.iter().map(|r| r.angle_rad).collect();
+        let known = |b: &crate::tube::MeasuredBend| Known { value: b.angle_rad, sigma: b.angle_sigma_rad };
+        let formed: Vec<Known> = measured.bends.iter().map(known).collect();
+        let outliers = self.springback.learn(&angles, &formed);
+        self.lengths.learn(commanded, measured);
+        self.rotations.learn(commanded, measured, nominal.tolerance.rotation_rad);
+        outliers
+    }
+
+    /// The tube that a table should give, on the nominal's radii.
+    fn expected(&self, nominal: &Nominal, commanded: &CommandTable) -> Lra {
+        let angles: Vec<f64> = commanded.bends.iter().map(|r| r.angle_rad).collect();
+        let formed: Vec<f64> =
+            angles.iter().enumerate().map(|(i, &c)| c - self.springback.at(i, c).value).collect();
+        let mut out = nominal.lra.clone();
+        for (i, bend) in out.bends.iter_mut().enumerate() {
+            bend.length_mm = commanded.bends[i].length_mm + self.lengths.growth(i, &angles, &formed).value;
+            bend.rotation_rad = commanded.bends[i].rotation_rad;
+            bend.angle_rad = formed[i];
+        }
+        out
+    }
+}
+
+/// The part's measurement in the nominal's direction, and whether the other fits nearly as well.
+fn oriented(
+    nominal: &Nominal,
+    part: &Part,
+    model: &Model,
+    turn: bool,
+) -> Result<(MeasuredTube, bool), Reason> {
+    let wanted = nominal.lra.bends.len();
+    let unusable = |text: String| Reason::new(Code::Unusable, text);
+    inspect::check(&part.measured).map_err(|e| unusable(e.to_string()))?;
+    part.commanded.validate().map_err(|e| unusable(format!("commanded table, {e}")))?;
+    if part.commanded.bends.len() != wanted {
+        let text = format!("the commanded table has {} bends, the part {wanted}", part.commanded.bends.len());
+        return Err(Reason::new(Code::Program, text + ": which program ran?"));
+    }
+    let settled = part.measured.reversed.is_some();
+    if part.measured.bends.len() != wanted {
+        let seen = inspect::inspect(&part.measured, nominal).map_err(|e| unusable(e.to_string()))?;
+        return Err(Reason::new(Code::BendCount, seen.advice));
+    }
+    let expected = model.expected(nominal, &part.commanded);
+    let reading = inspect::reading(&part.measured, &expected, settled);
+    if reading.wrong_hand {
+        let text = "the mirror image of the part fits better: check program and loading";
+        return Err(Reason::new(Code::WrongHand, text));
+    }
+    let mut measured =
+        if reading.reversed != turn { part.measured.reversed() } else { part.measured.clone() };
+    measured.reversed = Some(settled || reading.reversed != turn);
+    Ok((measured, !reading.clear))
+}

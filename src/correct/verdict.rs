@@ -1,0 +1,108 @@
+//! The answer of one correction step: verdict, table, reasons. Its JSON form is a contract.
+
+use serde::{Deserialize, Serialize};
+
+use crate::tube::CommandTable;
+
+/// What to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Bend the first piece with this table.
+    FirstPiece,
+    /// The last tube is good (apart from its last end, which the cut decides): keep the table.
+    InTolerance,
+    /// Bend the next tube with this table.
+    Correct,
+    /// The last scan does not tell enough: scan that tube again.
+    Rescan,
+    /// Something is wrong that no table can put right: look first.
+    Hold,
+}
+
+/// Why, for machines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Code {
+    /// A value in the history that no tube or table can have.
+    Unusable,
+    /// The same scan twice.
+    SameScan,
+    /// The commanded table is not this part's.
+    Program,
+    /// The scan shows another number of bends.
+    BendCount,
+    /// The mirror image fits better.
+    WrongHand,
+    /// Too far off to be this part.
+    WrongPart,
+    /// Both directions fit, and lead to different tables.
+    Direction,
+    /// The scan's sigma leaves no room in the tolerance.
+    TooUncertain,
+    /// A bend that does not fit what it did before.
+    Outlier,
+    /// Check points were not measured.
+    Unseen,
+    /// An angle changes.
+    Angle,
+    /// A feed changes.
+    Length,
+    /// A rotation changes.
+    Rotation,
+    /// A change was cut to the most that one part may bring.
+    StepLimit,
+    /// A command would go too far from the nominal.
+    TotalLimit,
+    /// A command would leave the machine's range.
+    MachineLimit,
+    /// A feed is held at the shortest that the machine can do.
+    Clamped,
+    /// The last straight is off: cut the tube longer or shorter.
+    CutLength,
+    /// Out of tolerance by scatter: nothing that a table could take out.
+    Scatter,
+    /// An earlier part of the history was not used.
+    LeftOut,
+}
+
+/// One reason.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Reason {
+    /// For machines.
+    pub code: Code,
+    /// For people, figures included.
+    pub text: String,
+    /// Bend or row it is about, counted from 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bend: Option<usize>,
+}
+
+impl Reason {
+    /// About the whole tube.
+    pub fn new(code: Code, text: impl Into<String>) -> Reason {
+        Reason { code, text: text.into(), bend: None }
+    }
+
+    /// About one bend, from 0.
+    pub fn at(code: Code, bend: usize, text: impl Into<String>) -> Reason {
+        Reason { code, text: text.into(), bend: Some(bend + 1) }
+    }
+}
+
+/// The answer of one step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Answer {
+    /// What to do next.
+    pub verdict: Verdict,
+    /// The table to bend with, or in rescan and hold the one in force.
+    pub commanded: CommandTable,
+    /// Predicted commanded minus formed angle per bend at this table.
+    pub springback_deg: Vec<f64>,
+    /// Sigma of that for the next tube, its scatter included.
+    pub springback_sigma_deg: Vec<f64>,
+    /// Why.
+    pub reasons: Vec<Reason>,
+}
