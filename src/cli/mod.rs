@@ -3,7 +3,11 @@
 //! Exit status: 0 done, 1 the tube or the machine said no, 2 the input or the arguments are unusable. Errors go
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
+mod push;
+mod push_text;
 mod reconstruct;
+mod simulate;
+mod simulate_bender;
 
 use std::process::ExitCode;
 
@@ -21,6 +25,11 @@ struct Cli {
 enum Command {
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
+    /// Delivers one table to a bender by hand: stage, verify, commit.
+    Push(push::Args),
+    /// Simulators on their own.
+    #[command(subcommand)]
+    Simulate(simulate::Simulate),
 }
 
 /// How a subcommand ended; errors (unusable input, exit 2) travel as `anyhow::Error`.
@@ -39,6 +48,8 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result: anyhow::Result<Outcome> = match cli.command {
         Command::Reconstruct(args) => reconstruct::run(&args),
+        Command::Push(args) => push::run(&args),
+        Command::Simulate(what) => simulate::run(&what),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
