@@ -9,9 +9,12 @@ use benderd::sim::scan::scan;
 use benderd::tube::{Lra, MeasuredTube, wrap_angle};
 
 fn main() {
-    let argument = |k: usize, default: u64| std::env::args().nth(k).and_then(|a| a.parse().ok()).unwrap_or(default);
+    let argument =
+        |k: usize, default: u64| std::env::args().nth(k).and_then(|a| a.parse().ok()).unwrap_or(default);
     let (first, count) = (argument(1, 0), argument(2, 30));
-    println!("seed radius_mm bends found   points  used  median_mm angle_deg rot_deg corner_mm clr_mm radius_mm  ms");
+    println!(
+        "seed radius_mm bends found   points  used  median_mm angle_deg rot_deg corner_mm clr_mm radius_mm  ms"
+    );
     let right = (first..first + count).filter(|&seed| case(seed)).count();
     println!("right number of bends: {right} of {count}");
 }

@@ -135,10 +135,10 @@ impl Profile {
             return Profile::parse(&Document::new(format!("protocols/{name}.toml (built in)"), *text));
         }
         let doc = Document::read(Path::new(name_or_path)).map_err(|error| match error {
-            ConfigError::Read { file, source } if source.kind() == std::io::ErrorKind::NotFound => {
+            ConfigError::Read { file, cause } if cause.kind() == std::io::ErrorKind::NotFound => {
                 let shipped = shipped_profiles().collect::<Vec<_>>().join(", ");
                 let hint = format!("no such file and no shipped profile of this name (shipped: {shipped})");
-                ConfigError::Read { file, source: std::io::Error::new(source.kind(), hint) }
+                ConfigError::Read { file, cause: std::io::Error::new(cause.kind(), hint) }
             }
             other => other,
         })?;

@@ -1,30 +1,73 @@
-//! Deliveries in the journal: an `intent` before each commit, an `outcome` after each delivery.
+//! Deliveries in the journal: an `intent` before each commit, an `outcome` after each delivery, and `resolved`
+//! when a later look at the machine decides what an outcome left open.
 //!
 //! `bender` says what must be kept, `journal` keeps it; this is where the two meet.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use serde_json::json;
+use serde_json::{Value, json};
 
-use crate::bender::{Intent, IntentLog, Job, LogError, Outcome};
+use crate::bender::{Intent, IntentLog, Job, LogError, Outcome, TableId};
 use crate::journal::{Journal, JournalError, Record};
 
 /// A journal in the shape that a delivery wants.
 #[derive(Debug)]
 pub struct JournalledIntents<'a> {
     journal: &'a mut Journal,
-    bender: String,
-    /// Record of the outcome, once it is on disk.
+    machine: String,
+    /// Record of the last outcome, once it is on disk.
     pub recorded: Option<Record>,
 }
 
 impl<'a> JournalledIntents<'a> {
-    /// Intents of the machine named `bender` go to this journal.
-    pub fn new(journal: &'a mut Journal, bender: impl Into<String>) -> JournalledIntents<'a> {
-        JournalledIntents { journal, bender: bender.into(), recorded: None }
+    /// Intents of the machine at this endpoint go to this journal.
+    pub fn new(journal: &'a mut Journal, machine: impl Into<String>) -> JournalledIntents<'a> {
+        JournalledIntents { journal, machine: machine.into(), recorded: None }
     }
 
-    fn append(&mut self, kind: &str, content: serde_json::Value) -> Result<Record, JournalError> {
+    /// Decides an earlier commit whose outcome is open (it was unknown, or the program died before writing it
+    /// down) by the table that the machine holds now, and records that. None when nothing is open.
+    pub fn resolve(&mut self, active: TableId) -> Result<Option<Outcome>, JournalError> {
+        let Some((new, old)) = self.open_intent()? else { return Ok(None) };
+        let outcome = if active == new {
+            Outcome::Applied(new)
+        } else if active == old {
+            Outcome::NotApplied { why: format!("{new} did not take effect, the machine holds {active}") }
+        } else {
+            Outcome::Unknown {
+                why: format!("{new} was committed over {old}, the machine now holds {active}"),
+            }
+        };
+        let content = json!({ "machine": self.machine, "committed": new, "result": outcome });
+        self.append("resolved", content)?;
+        Ok(Some(outcome))
+    }
+
+    /// New and old table of the last intent, if nothing decided it since.
+    fn open_intent(&self) -> Result<Option<(TableId, TableId)>, JournalError> {
+        let (mut open, mut after) = (None, 0);
+        loop {
+            let records = self.journal.list(after, 1000)?;
+            let Some(last) = records.last() else { return Ok(open) };
+            after = last.seq;
+            for record in records {
+                let Ok(content) = serde_json::from_str::<Value>(&record.content) else { continue };
+                if content["machine"] != self.machine.as_str() {
+                    continue;
+                }
+                match record.kind.as_str() {
+                    "intent" => {
+                        open = Some((id_of(&content["intent"]["new"]), id_of(&content["intent"]["old"])))
+                    }
+                    "outcome" if content["result"]["outcome"] != "unknown" => open = None,
+                    "resolved" => open = None,
+                    _ => {}
+                }
+            }
+        }
+    }
+
+    fn append(&mut self, kind: &str, content: Value) -> Result<Record, JournalError> {
         // A clock before 1970 is wrong in any case; the order of records does not depend on it.
         let time_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_millis());
         self.journal.append(i64::try_from(time_ms).unwrap_or(i64::MAX), kind, &content.to_string())
@@ -33,19 +76,89 @@ impl<'a> JournalledIntents<'a> {
 
 impl IntentLog for JournalledIntents<'_> {
     fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
-        let content = json!({ "machine": self.bender, "intent": intent });
+        let content = json!({ "machine": self.machine, "intent": intent });
         self.append("intent", content)?;
         Ok(())
     }
 
     fn outcome(&mut self, job: &Job, intent: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError> {
         let content = json!({
-            "machine": self.bender,
+            "machine": self.machine,
             "program": job.program,
             "committed": intent.map(|i| i.new),
             "result": outcome,
         });
         self.recorded = Some(self.append("outcome", content)?);
         Ok(())
+    }
+}
+
+/// What is missing or damaged reads as no table, which matches none.
+fn id_of(value: &Value) -> TableId {
+    let number = |key: &str| value[key].as_u64().and_then(|n| u32::try_from(n).ok()).unwrap_or(0);
+    TableId { revision: number("revision"), crc: number("crc") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tube::CommandTable;
+
+    const OLD: TableId = TableId { revision: 7, crc: 1 };
+    const NEW: TableId = TableId { revision: 8, crc: 2 };
+
+    fn intent() -> Intent {
+        Intent {
+            bender: "b".into(),
+            program: "P1".into(),
+            new: NEW,
+            old: OLD,
+            table: CommandTable::default(),
+        }
+    }
+
+    fn job() -> Job {
+        Job { program: "P1".into(), table: CommandTable::default(), expected_active: None }
+    }
+
+    fn with_log(test: impl FnOnce(&mut JournalledIntents)) {
+        let dir = tempfile::tempdir().unwrap();
+        let mut journal = Journal::open(&dir.path().join("j.db")).unwrap();
+        test(&mut JournalledIntents::new(&mut journal, "m:1"));
+    }
+
+    #[test]
+    fn an_intent_without_an_outcome_is_decided_by_the_machine_once() {
+        for (found, expected) in
+            [(NEW, "applied"), (OLD, "not_applied"), (TableId { revision: 9, crc: 3 }, "unknown")]
+        {
+            with_log(|log| {
+                assert_eq!(log.resolve(found).unwrap(), None, "nothing is open at first");
+                log.intent(&intent()).unwrap();
+                let outcome = serde_json::to_value(log.resolve(found).unwrap()).unwrap();
+                assert_eq!(outcome["outcome"], expected);
+                assert_eq!(log.resolve(found).unwrap(), None, "decided once");
+            });
+        }
+    }
+
+    #[test]
+    fn a_known_outcome_closes_the_intent_and_an_unknown_one_does_not() {
+        with_log(|log| {
+            log.intent(&intent()).unwrap();
+            log.outcome(&job(), Some(&intent()), &Outcome::Applied(NEW)).unwrap();
+            assert_eq!(log.resolve(OLD).unwrap(), None);
+            log.intent(&intent()).unwrap();
+            log.outcome(&job(), Some(&intent()), &Outcome::Unknown { why: "w".into() }).unwrap();
+            assert_eq!(log.resolve(NEW).unwrap(), Some(Outcome::Applied(NEW)));
+        });
+    }
+
+    #[test]
+    fn another_machine_is_another_matter() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut journal = Journal::open(&dir.path().join("j.db")).unwrap();
+        JournalledIntents::new(&mut journal, "m:1").intent(&intent()).unwrap();
+        assert_eq!(JournalledIntents::new(&mut journal, "m:2").resolve(NEW).unwrap(), None);
     }
 }

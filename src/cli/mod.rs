@@ -6,7 +6,11 @@
 mod convert;
 mod correct;
 mod inspect;
+mod push;
+mod push_text;
 mod reconstruct;
+mod simulate;
+mod simulate_bender;
 
 use std::process::ExitCode;
 
@@ -32,6 +36,11 @@ enum Command {
     Correct(correct::Args),
     /// Converts bending tables between LRA, XYZ and YBC.
     Convert(convert::Args),
+    /// Delivers one table to a bender by hand: stage, verify, commit.
+    Push(push::Args),
+    /// Simulators on their own.
+    #[command(subcommand)]
+    Simulate(simulate::Simulate),
 }
 
 /// Units in which scan files come.
@@ -75,6 +84,8 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => inspect::run(&args),
         Command::Correct(args) => correct::run(&args),
         Command::Convert(args) => convert::run(&args),
+        Command::Push(args) => push::run(&args),
+        Command::Simulate(what) => simulate::run(&what),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

@@ -12,20 +12,20 @@ use toml::Spanned;
 #[derive(Debug, Error)]
 pub enum ConfigError {
     /// The file could not be read.
-    #[error("{file}: cannot be read: {source}")]
+    #[error("{file}: cannot be read: {cause}")]
     Read {
         /// Path as given.
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file could not be written.
-    #[error("{file}: cannot be written: {source}")]
+    #[error("{file}: cannot be written: {cause}")]
     Write {
         /// Path as given.
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// Not TOML, an unknown key, a missing key or a value of the wrong type.
     #[error("{file}: {detail}")]
@@ -69,7 +69,7 @@ impl Document {
         let file = path.display().to_string();
         match std::fs::read_to_string(path) {
             Ok(text) => Ok(Document { file, text }),
-            Err(source) => Err(ConfigError::Read { file, source }),
+            Err(cause) => Err(ConfigError::Read { file, cause }),
         }
     }
 

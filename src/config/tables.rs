@@ -57,7 +57,7 @@ pub fn parse_table(doc: &Document) -> Result<Table, ConfigError> {
 /// Writes a table as CSV, header first.
 pub fn write_table(path: &Path, table: &Table) -> Result<(), ConfigError> {
     std::fs::write(path, format_table(table))
-        .map_err(|source| ConfigError::Write { file: path.display().to_string(), source })
+        .map_err(|cause| ConfigError::Write { file: path.display().to_string(), cause })
 }
 
 /// The CSV text of a table, header first, a line end after every row.

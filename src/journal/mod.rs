@@ -37,12 +37,12 @@ const SCHEMA: &str = "
 #[derive(Debug, Error)]
 pub enum JournalError {
     /// SQLite said no: disk full, no permission, not a database.
-    #[error("journal {file}: {source}; check the disk, the permissions and that no other program locks it")]
+    #[error("journal {file}: {cause}; check the disk, the permissions and that no other program locks it")]
     Sqlite {
         /// Path as given.
         file: String,
         /// What SQLite said.
-        source: rusqlite::Error,
+        cause: rusqlite::Error,
     },
     /// A database of something else.
     #[error("journal {file}: this is a database of another program (application id 0x{found:08X})")]
@@ -117,7 +117,7 @@ impl Journal {
     /// Opens a journal, or makes a new one. The folder must exist.
     pub fn open(path: &Path) -> Result<Journal, JournalError> {
         let file = path.display().to_string();
-        let wrap = |source| JournalError::Sqlite { file: file.clone(), source };
+        let wrap = |cause| JournalError::Sqlite { file: file.clone(), cause };
         let mut connection = Connection::open(path).map_err(wrap)?;
         connection.busy_timeout(Duration::from_secs(5)).map_err(wrap)?;
         let pragma = |c: &Connection, name| c.pragma_query_value(None, name, |row| row.get::<_, i64>(0));
@@ -154,7 +154,7 @@ impl Journal {
     /// Adds a record; it is on disk when this returns. Several processes may do so on one file.
     pub fn append(&mut self, time_ms: i64, kind: &str, content: &str) -> Result<Record, JournalError> {
         let file = &self.file;
-        let wrap = |source| JournalError::Sqlite { file: file.clone(), source };
+        let wrap = |cause| JournalError::Sqlite { file: file.clone(), cause };
         let transaction =
             self.connection.transaction_with_behavior(TransactionBehavior::Immediate).map_err(wrap)?;
         let last: Option<(i64, String)> = transaction
@@ -192,7 +192,7 @@ impl Journal {
             let limit = i64::try_from(limit).unwrap_or(i64::MAX);
             statement.query_map(params![after, limit], record_of)?.collect()
         };
-        query().map_err(|source| JournalError::Sqlite { file: self.file.clone(), source })
+        query().map_err(|cause| JournalError::Sqlite { file: self.file.clone(), cause })
     }
 
     /// Walks the whole chain; the number of records when it is whole.

@@ -1,0 +1,244 @@
+//! `benderd push`: delivers one table by hand, through the same gate and handshake as the daemon.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, bail};
+use serde::{Deserialize, Serialize};
+
+use super::{Outcome as Exit, push_text};
+use crate::bender::{
+    ActiveTable, Bender as _, Intent, IntentLog as _, Job, ModbusLink, Outcome, Profile, Reason, TableId,
+    deliver, gate, prepare,
+};
+use crate::cell::JournalledIntents;
+use crate::config::{Table, read_table};
+use crate::journal::Journal;
+use crate::tube::{CommandTable, Lra};
+
+/// Arguments of `benderd push`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The table: CSV (LRA, XYZ or YBC, told apart by the header) or the JSON of `benderd correct`.
+    table: PathBuf,
+    /// What kind of machine: a shipped profile's name or a profile file.
+    #[arg(long, value_name = "PROFILE")]
+    bender: String,
+    /// Where the machine is [default: the profile's endpoint].
+    #[arg(long, value_name = "HOST:PORT")]
+    on: Option<String>,
+    /// The program that must be loaded [default: the table's file name without its ending].
+    #[arg(long, value_name = "NAME")]
+    program: Option<String>,
+    /// Connects and reads, says what would be done, writes nothing.
+    #[arg(long)]
+    dry_run: bool,
+    /// The journal [default: $STATE_DIRECTORY/journal.db, else benderd/journal.db in $XDG_STATE_HOME or
+    /// ~/.local/state].
+    #[arg(long, value_name = "FILE")]
+    journal: Option<PathBuf>,
+    /// Prints one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Everything that is known at the end; its JSON form is what `--json` prints.
+#[derive(Debug, Serialize)]
+pub(super) struct Report {
+    pub bender: String,
+    pub endpoint: String,
+    pub program: String,
+    pub dry_run: bool,
+    /// The table in force before; absent when the machine could not be read.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub active: Option<TableId>,
+    /// The table to be put in force.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub new: Option<TableId>,
+    #[serde(flatten)]
+    pub result: Ending,
+    /// An earlier delivery whose outcome was open until now.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub resolved: Option<Outcome>,
+    /// The journal's record of the outcome.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub record: Option<i64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub journal: Option<String>,
+}
+
+/// How it ended.
+#[derive(Debug, Serialize)]
+#[serde(untagged)]
+pub(super) enum Ending {
+    Delivered(Outcome),
+    /// A dry run that met no objection.
+    WouldApply {
+        outcome: &'static str,
+    },
+}
+
+/// Runs the subcommand.
+pub fn run(args: &Args) -> anyhow::Result<Exit> {
+    let profile = Profile::load(&args.bender)?;
+    let (table, notes) = read_commanded(&args.table)?;
+    let program = match &args.program {
+        Some(program) => program.clone(),
+        None => args.table.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+    };
+    let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
+    let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
+    if !args.json {
+        notes.iter().for_each(|note| println!("note      {note}"));
+    }
+    let job = Job { program, table, expected_active: None };
+    let mut link = ModbusLink::new(profile, endpoint);
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let report = runtime.block_on(push(args, &mut link, job, journal.as_mut()));
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        push_text::ending(&report);
+    }
+    Ok(match &report.result {
+        Ending::WouldApply { .. } => Exit::Done,
+        Ending::Delivered(Outcome::Applied(_) | Outcome::AlreadyActive(_)) => Exit::Done,
+        Ending::Delivered(Outcome::Rejected { .. } | Outcome::NotApplied { .. }) => Exit::No,
+        Ending::Delivered(Outcome::Unknown { .. }) => Exit::Unknown,
+    })
+}
+
+async fn push(args: &Args, link: &mut ModbusLink, mut job: Job, journal: Option<&mut Journal>) -> Report {
+    let mut report = Report {
+        bender: link.profile().name.clone(),
+        endpoint: link.endpoint().to_owned(),
+        program: job.program.clone(),
+        dry_run: args.dry_run,
+        active: None,
+        new: None,
+        result: Ending::WouldApply { outcome: "would_apply" },
+        resolved: None,
+        record: None,
+        journal: journal.as_ref().map(|j| j.file().to_owned()),
+    };
+    let look = look(link, &job).await;
+    if let Ok(active) = &look {
+        let active_id = active.status.active;
+        job.expected_active = Some(active_id); // what is shown here is what may be replaced
+        report.active = Some(active_id);
+        if let Ok(prepared) = prepare(link.profile(), &job) {
+            let same = active_id.revision != 0 && active_id.crc == prepared.crc;
+            let revision = active_id.revision.wrapping_add(u32::from(!same));
+            report.new = Some(TableId { revision, crc: prepared.crc });
+        }
+        if !args.json {
+            push_text::comparison(link.profile(), &report, &job, active);
+        }
+    }
+    let Some(journal) = journal else {
+        report.result = look
+            .and_then(|active| rehearse(link.profile(), &job, &active))
+            .map_or_else(Ending::Delivered, |outcome| {
+                outcome.map_or(Ending::WouldApply { outcome: "would_apply" }, Ending::Delivered)
+            });
+        return report;
+    };
+    let mut log = JournalledIntents::new(journal, link.endpoint());
+    let outcome = match look {
+        Ok(active) => {
+            report.resolved = resolve(&mut log, &active);
+            deliver(link, &job, &mut log).await
+        }
+        Err(outcome) => {
+            // A failure shows as a missing record below.
+            let _ = log.outcome(&job, None::<&Intent>, &outcome);
+            outcome
+        }
+    };
+    report.record = log.recorded.as_ref().map(|r| r.seq);
+    report.result = Ending::Delivered(outcome);
+    report
+}
+
+/// Limits first, then the machine: what breaks a limit needs no connection.
+async fn look(link: &mut ModbusLink, job: &Job) -> Result<ActiveTable, Outcome> {
+    prepare(link.profile(), job).map_err(|reasons| Outcome::Rejected { reasons })?;
+    link.read_active().await.map_err(|error| Outcome::NotApplied { why: error.to_string() })
+}
+
+/// What a delivery would meet: an objection, "already active", or nothing.
+fn rehearse(profile: &Profile, job: &Job, active: &ActiveTable) -> Result<Option<Outcome>, Outcome> {
+    let prepared = prepare(profile, job).map_err(|reasons| Outcome::Rejected { reasons })?;
+    let reasons: Vec<Reason> = gate(profile, &prepared, &active.status);
+    if active.status.active.revision != 0 && active.status.active.crc == prepared.crc {
+        return Ok(Some(Outcome::AlreadyActive(active.status.active)));
+    }
+    if reasons.is_empty() { Ok(None) } else { Err(Outcome::Rejected { reasons }) }
+}
+
+/// An earlier commit whose outcome stayed open is decided by what the machine holds now.
+fn resolve(log: &mut JournalledIntents, active: &ActiveTable) -> Option<Outcome> {
+    match log.resolve(active.status.active) {
+        Ok(resolved) => resolved,
+        Err(error) => {
+            eprintln!("warning: an open delivery could not be looked up: {error}");
+            None
+        }
+    }
+}
+
+/// What `benderd correct` printed, as far as it matters here.
+#[derive(Deserialize)]
+struct Corrected {
+    verdict: Option<String>,
+    commanded: CommandTable,
+    #[serde(default)]
+    reasons: Vec<CorrectedReason>,
+}
+
+#[derive(Deserialize)]
+struct CorrectedReason {
+    text: String,
+}
+
+/// The table of a file, with what its author had to say.
+fn read_commanded(path: &Path) -> anyhow::Result<(CommandTable, Vec<String>)> {
+    let name = path.display();
+    if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
+        let text = std::fs::read_to_string(path).with_context(|| format!("{name}: cannot be read"))?;
+        let corrected: Corrected = serde_json::from_str(&text).with_context(|| {
+            format!("{name}: not the JSON of `benderd correct --json` (field \"commanded\")")
+        })?;
+        corrected.commanded.validate().with_context(|| name.to_string())?;
+        let verdict = corrected.verdict.filter(|v| v == "hold" || v == "rescan");
+        let notes = verdict.into_iter().map(|v| format!("the correction's verdict was {v:?}"));
+        return Ok((
+            corrected.commanded,
+            notes.chain(corrected.reasons.into_iter().map(|r| r.text)).collect(),
+        ));
+    }
+    let lra = match read_table(path)? {
+        Table::Lra(lra) => lra,
+        Table::Ybc(ybc) => Lra::from(&ybc),
+        Table::Xyz(polygon) => polygon.to_lra().with_context(|| name.to_string())?.0,
+    };
+    Ok((CommandTable::from_lra(&lra), Vec::new()))
+}
+
+/// The journal of a service is in its state directory, a person's in theirs.
+fn open_journal(given: Option<&Path>) -> anyhow::Result<Journal> {
+    if let Some(path) = given {
+        return Ok(Journal::open(path)?);
+    }
+    let folder = if let Some(service) = std::env::var_os("STATE_DIRECTORY") {
+        PathBuf::from(service)
+    } else if let Some(state) = std::env::var_os("XDG_STATE_HOME").filter(|s| !s.is_empty()) {
+        PathBuf::from(state).join("benderd")
+    } else if let Some(home) = std::env::home_dir() {
+        home.join(".local/state/benderd")
+    } else {
+        bail!("no place for the journal: set HOME or give --journal FILE");
+    };
+    std::fs::create_dir_all(&folder)
+        .with_context(|| format!("{}: the journal's folder cannot be made", folder.display()))?;
+    Ok(Journal::open(&folder.join("journal.db"))?)
+}

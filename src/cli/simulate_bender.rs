@@ -1,0 +1,85 @@
+//! `benderd simulate bender`: a bender on a socket, until Ctrl-C or SIGTERM.
+
+use std::io::Write as _;
+
+use anyhow::{Context as _, bail};
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::Outcome;
+use crate::bender::Profile;
+use crate::sim::bender::{MachineEvent, MachineModel};
+use crate::sim::bender_server::{Fault, SimulatedBender};
+
+/// Arguments of `benderd simulate bender`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// What kind of machine: a shipped profile's name or a profile file.
+    #[arg(long, default_value = "reference-modbus")]
+    profile: String,
+    /// Where to listen [default: the profile's endpoint]; port 0 takes a free one.
+    #[arg(long, value_name = "HOST:PORT")]
+    on: Option<String>,
+    /// Name of the loaded program.
+    #[arg(long, default_value = "bracket-17")]
+    program: String,
+    /// Bends of the loaded program.
+    #[arg(long, default_value_t = 4)]
+    bends: u16,
+    /// A way to misbehave: silent, late:MS, other-program, other-bends, running, corrupt-staging,
+    /// drop-before-apply, drop-after-apply, silent-after-commit, busy, frozen.
+    #[arg(long)]
+    fault: Option<Fault>,
+}
+
+/// Runs the subcommand.
+pub fn run(args: &Args) -> anyhow::Result<Outcome> {
+    let profile = Profile::load(&args.profile)?;
+    let longest = 2 * usize::from(profile.table.program_registers);
+    if args.program.is_empty() || args.program.len() > longest || !args.program.is_ascii() {
+        bail!("--program {:?}: allowed are 1 to {longest} ASCII characters", args.program);
+    }
+    if usize::from(args.bends) > profile.limits.max_bends {
+        bail!("--bends {}: profile {} has room for {}", args.bends, profile.name, profile.limits.max_bends);
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(serve(args, profile))
+}
+
+async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
+    let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
+    let listener = TcpListener::bind(&on).await.with_context(|| format!("--on {on}: cannot listen"))?;
+    let name = profile.name.clone();
+    let model = MachineModel::new(profile, &args.program, args.bends);
+    let bender = SimulatedBender::start(listener, model, args.fault, |event| say(&describe(&event)))?;
+    say(&format!(
+        "simulated bender {name} listens on {}; program {:?} with {} bends is loaded",
+        bender.address(),
+        args.program,
+        args.bends
+    ));
+    let mut terminate = signal(SignalKind::terminate())?;
+    tokio::select! {
+        _ = terminate.recv() => {}
+        result = tokio::signal::ctrl_c() => result?,
+    }
+    say("stopped");
+    Ok(Outcome::Done)
+}
+
+fn describe(event: &MachineEvent) -> String {
+    match event {
+        MachineEvent::TakenOver { id, program, bends } => {
+            format!("table taken over: {id}, program {program:?}, {bends} bends")
+        }
+        MachineEvent::Refused { id, code } => {
+            format!("commit refused with code {code} ({}): {id}", crate::bender::Ack::meaning(*code))
+        }
+    }
+}
+
+/// One line at once, also into a pipe; nobody reading it is no reason to stop.
+fn say(line: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}
