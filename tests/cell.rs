@@ -5,10 +5,9 @@ use std::time::Duration;
 
 use benderd::arm::ScanFile;
 use benderd::bender::TableId;
-use benderd::cell::{
-    Action, Cell, Decision, Delivered, Dwell, Event, InForce, Purpose, State, Ticket, Verdict,
-};
+use benderd::cell::{Action, Cell, Decision, Delivered, Dwell, Event, InForce, Purpose, State, Ticket};
 use benderd::config::Mode;
+use benderd::correct::{Answer, Code, Reason, Verdict};
 use benderd::tube::{CommandTable, MeasuredTube};
 
 /// A cell with a clock turned by hand. It remembers the ticket of the last work it was asked for.
@@ -41,7 +40,14 @@ fn tube() -> Box<MeasuredTube> {
 }
 
 fn decision(verdict: Verdict) -> Box<Decision> {
-    Box::new(Decision { verdict, table: table(7.0), reasons: "why".into(), inspection: None })
+    let answer = Answer {
+        verdict,
+        commanded: table(7.0),
+        springback_deg: Vec::new(),
+        springback_sigma_deg: Vec::new(),
+        reasons: vec![Reason::new(Code::Scatter, "why")],
+    };
+    Box::new(Decision { answer, inspection: None })
 }
 
 impl Bench {

@@ -242,12 +242,7 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
                 record(&mut self.journal, "measurement", &content);
             }
             Event::Decided(ticket, decision) if self.cell.is_current(*ticket) => {
-                let content = json!({
-                    "machine": cell,
-                    "verdict": decision.verdict,
-                    "commanded": decision.table,
-                    "reasons": decision.reasons,
-                });
+                let content = json!({ "machine": cell, "answer": decision.answer });
                 record(&mut self.journal, "decision", &content);
                 self.tell_decision(decision);
             }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use crate::arm::ScanFile;
 use crate::bender::TableId;
+use crate::correct::Answer;
 use crate::inspect::Inspection;
 use crate::tube::{CommandTable, MeasuredTube};
 
@@ -23,34 +24,20 @@ pub struct InForce {
     pub table: CommandTable,
 }
 
-/// What the next table shall be, and why.
+/// What `correct` answered, and the inspection that a person wants to see with it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decision {
-    /// What to do.
-    pub verdict: Verdict,
-    /// The table to put in force (for `FirstPiece` and `Correct`).
-    pub table: CommandTable,
-    /// Reasons in words, for the operator.
-    pub reasons: String,
-    /// The last part against its nominal, as decided on; none for a first piece. For people and the journal: the
-    /// cell itself does not look at it.
+    /// Verdict, table and reasons.
+    pub answer: Answer,
+    /// The last part against its nominal; none for a first piece.
     pub inspection: Option<Box<Inspection>>,
 }
 
-/// The verdict of one decision.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// No part yet: start with this table.
-    FirstPiece,
-    /// The part is good: nothing to write.
-    InTolerance,
-    /// Put this table in force.
-    Correct,
-    /// The scan cannot be decided on.
-    Rescan,
-    /// A person must look.
-    Hold,
+impl Decision {
+    /// The reasons in one line, for the operator.
+    pub fn reasons(&self) -> String {
+        self.answer.reasons.iter().map(|r| r.text.as_str()).collect::<Vec<_>>().join("; ")
+    }
 }
 
 /// How a delivery ended.

@@ -8,10 +8,11 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
+use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 use crate::arm::ScanFile;
 use crate::bender::TableId;
 use crate::config::Mode;
+use crate::correct::Verdict;
 use crate::tube::{CommandTable, MeasuredTube};
 
 /// Scans in a row that could not be used before a person must look.
@@ -375,26 +376,26 @@ impl Cell {
     }
 
     fn decided(&mut self, scan: Option<ScanFile>, decision: Decision) -> Vec<Action> {
-        match (decision.verdict, scan) {
+        match (decision.answer.verdict, scan) {
             (Verdict::Rescan, Some(scan)) => {
                 self.history.pop();
-                self.unusable(scan, decision.reasons)
+                self.unusable(scan, decision.reasons())
             }
             (Verdict::Hold, Some(scan)) => {
                 self.history.pop();
-                self.held_by_decision(scan, decision.reasons)
+                self.held_by_decision(scan, decision.reasons())
             }
-            (Verdict::Hold | Verdict::Rescan, None) => self.hold(decision.reasons),
+            (Verdict::Hold | Verdict::Rescan, None) => self.hold(decision.reasons()),
             (verdict, scan) => {
                 self.unusable = 0;
                 match scan {
                     Some(scan) => {
                         let mut actions = vec![Action::FileDone(scan)];
-                        actions.extend(self.go_on(verdict, decision.table));
+                        actions.extend(self.go_on(verdict, decision.answer.commanded));
                         actions
                     }
                     None if verdict == Verdict::InTolerance => self.wait(),
-                    None => self.go_on(verdict, decision.table),
+                    None => self.go_on(verdict, decision.answer.commanded),
                 }
             }
         }

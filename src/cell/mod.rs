@@ -5,19 +5,21 @@
 //! driver           performs what it asks for: scans, measuring, deciding, journal
 //! worker           the machine's side of that, one thing at a time
 //! intents          deliveries in the journal
-//! setup            benderd.toml's cell with everything it names
+//! setup, chain     benderd.toml's cell with everything it names; the pure rooms in a row
 //! ```
 
+mod chain;
 mod driver;
 mod event;
 mod intents;
 mod journalling;
 mod machine;
-mod measure;
+mod setup;
 mod worker;
 
+pub use chain::{Chain, measure};
 pub use driver::{Command, Craft, Decided, Driver, Identity, Notice};
-pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket, Verdict};
+pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 pub use intents::JournalledIntents;
 pub use machine::{Cell, Fault, Part, Purpose, State};
-pub use measure::measure;
+pub use setup::{Setup, SetupError};

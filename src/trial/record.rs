@@ -46,34 +46,37 @@ impl PartRecord {
         writeln!(out, "  Part {}, bent with table revision {}", self.number, self.revision)?;
         writeln!(
             out,
-            "          nominal  commanded        measured  deviation   rotation    length       next"
+            "    bend   angle   commanded         measured   deviation     next   rotation    length"
         )?;
         writeln!(
             out,
-            "    bend      deg        deg             deg        deg   dev. deg   dev. mm    command"
+            "             deg         deg              deg         deg  command   dev. deg   dev. mm"
         )?;
         for (i, bend) in self.inspection.bends.iter().enumerate() {
             let angle = &bend.angle_deg;
             let commanded = self.commanded.bends.get(i).map(|row| row.angle_rad.to_degrees());
             let next = self.next.as_ref().and_then(|t| t.bends.get(i)).map(|row| row.angle_rad.to_degrees());
+            let change = next.zip(commanded).map(|(n, c)| n - c).filter(|d| d.abs() >= 0.005);
             writeln!(
                 out,
-                "    {:>4} {:8.2} {:>10} {:>8} ± {:<5}{:>10} {:>10} {:>9} {:>10}",
+                "    {:>4} {:7.2} {:>11} {:>8} ± {:<5} {:>11} {:>8} {:>10} {:>9}",
                 bend.bend,
                 angle.nominal,
                 number(commanded, 2, false),
                 number(angle.measured, 2, false),
-                number(angle.sigma, 2, false),
+                number(angle.sigma, 3, false),
                 number(angle.deviation, 2, true),
+                number(change, 2, true),
                 number(bend.rotation_deg.deviation.filter(|_| i > 0), 2, true),
                 number(bend.length_mm.deviation, 2, true),
-                number(next.zip(commanded).map(|(n, c)| n - c), 2, true),
             )?;
         }
+        let tail = self.inspection.last_length_mm.as_ref().and_then(|c| c.deviation);
+        writeln!(out, "    tail {:>78}", number(tail, 2, true))?;
         if let Some(worst) = self.worst() {
             let (mm, limit) = (worst.deviation_mm, self.inspection.envelope_mm);
             let place = place(worst);
-            writeln!(out, "    envelope: {mm:.2} mm at the {place}, allowed {limit:.2} mm")?;
+            writeln!(out, "    worst check point: {mm:.2} mm at the {place}, allowed {limit:.2} mm")?;
         }
         writeln!(out, "    {}", self.inspection.advice)
     }
