@@ -166,12 +166,13 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
         self.put_on_record(&event);
         let before = self.cell.state().clone();
         let actions = self.cell.on(self.started.elapsed(), event);
-        self.tell_state(&before);
         for action in actions {
             if let Err(error) = self.perform(action).await {
                 self.filing_error = Some(format!("scans cannot be filed away: {error}"));
             }
         }
+        // Only now: whoever hears "waiting for a scan" may bring one, and older ones are out of the way.
+        self.tell_state(&before);
     }
 
     async fn perform(&mut self, action: Action) -> Result<(), ArmError> {

@@ -6,6 +6,7 @@ use std::fmt::Write;
 use nalgebra::{Point3, Vector3};
 
 use super::record::PartRecord;
+use crate::inspect::Verdict;
 use crate::tube::align::{Pair, register};
 use crate::tube::{Frame, Lra, Nominal, Spine};
 
@@ -208,9 +209,13 @@ fn envelope(svg: &mut String, nominal: &Nominal, parts: &[PartRecord]) -> std::f
 fn tube(svg: &mut String, nominal: &Nominal, parts: &[PartRecord]) -> std::fmt::Result {
     heading(svg, 28.0, &format!("The tube (deviations drawn {EXAGGERATION:.0} times larger)"))?;
     let wanted = samples(&Spine::from_lra(&nominal.lra, Frame::identity()));
-    let shown = [(parts.first(), "#cf222e"), (parts.last(), "#2da44e")];
+    let shown: Vec<(&PartRecord, &str)> = match parts {
+        [] => Vec::new(),
+        [only] => vec![(only, verdict_colour(only))],
+        [first, .., last] => vec![(first, "#cf222e"), (last, verdict_colour(last))],
+    };
     let mut lines = vec![wanted.clone()];
-    lines.extend(shown.iter().filter_map(|(p, _)| Some(exaggerated(&nominal.lra, &wanted, (*p)?))));
+    lines.extend(shown.iter().map(|(part, _)| exaggerated(&nominal.lra, &wanted, part)));
     let view = View::fit(&lines, (28.0, TOP + 6.0, 410.0, BOTTOM + 20.0));
     let width = (nominal.od_mm * view.scale).max(3.0);
     let round = "stroke-linejoin=\"round\" stroke-linecap=\"round\"";
@@ -221,18 +226,23 @@ fn tube(svg: &mut String, nominal: &Nominal, parts: &[PartRecord]) -> std::fmt::
         &nominal_line,
         &format!("stroke=\"#f0f3f6\" stroke-width=\"{:.1}\" {round}", 0.45 * width),
     )?;
-    for (points, (_, colour)) in lines.iter().skip(1).zip(shown) {
+    for (points, (_, colour)) in lines.iter().skip(1).zip(&shown) {
         polyline(svg, &view.line(points), &format!("stroke=\"{colour}\" stroke-width=\"2.5\" {round}"))?;
     }
     let mut x = 28.0;
-    let last = format!("part {}", parts.len());
-    for (colour, words) in [("#b6bec7", "nominal"), ("#cf222e", "part 1"), ("#2da44e", last.as_str())] {
+    let named = shown.iter().map(|(part, colour)| (*colour, format!("part {}", part.number)));
+    for (colour, words) in [("#b6bec7", "nominal".to_owned())].into_iter().chain(named) {
         let y = BOTTOM + 44.0;
         line(svg, (x, y - 4.5), (x + 18.0, y - 4.5), &format!("stroke=\"{colour}\" stroke-width=\"3\""))?;
-        text(svg, x + 24.0, y, "fill=\"#57606a\" font-size=\"12\"", words)?;
+        text(svg, x + 24.0, y, "fill=\"#57606a\" font-size=\"12\"", &words)?;
         x += 44.0 + 7.5 * words.len() as f64;
     }
     Ok(())
+}
+
+/// Green for a good part; a first part among several is red whatever it is, to be told from the last.
+fn verdict_colour(part: &PartRecord) -> &'static str {
+    if part.inspection.verdict == Verdict::InTolerance { "#2da44e" } else { "#bf8700" }
 }
 
 /// The same number of points on every spine, at equal shares of each segment: they belong together pair by pair.
@@ -269,11 +279,27 @@ struct View {
 }
 
 impl View {
-    /// The largest picture of all lines that fits (left, top, right, bottom).
-    fn fit(lines: &[Vec<Point3<f64>>], (left, top, right, bottom): (f64, f64, f64, f64)) -> View {
+    /// The view among some turns about the line of sight in which all lines fill the box (left, top, right, bottom)
+    /// best.
+    fn fit(lines: &[Vec<Point3<f64>>], frame: (f64, f64, f64, f64)) -> View {
         let towards = Vector3::new(0.55, -0.75, 0.55).normalize();
         let side = Vector3::z().cross(&towards).normalize();
-        let mut view = View { right: side, up: towards.cross(&side), scale: 1.0, origin: (0.0, 0.0) };
+        let up = towards.cross(&side);
+        let turns = (0..36).map(|k| {
+            let (sin, cos) = (f64::from(k) * 10f64.to_radians()).sin_cos();
+            View::turned(side * cos + up * sin, up * cos - side * sin, lines, frame)
+        });
+        let larger = |best: View, next: View| if next.scale > best.scale { next } else { best };
+        turns.fold(View::turned(side, up, lines, frame), larger)
+    }
+
+    fn turned(
+        side: Vector3<f64>,
+        up: Vector3<f64>,
+        lines: &[Vec<Point3<f64>>],
+        (left, top, right, bottom): (f64, f64, f64, f64),
+    ) -> View {
+        let mut view = View { right: side, up, scale: 1.0, origin: (0.0, 0.0) };
         let flat: Vec<(f64, f64)> = lines.iter().flat_map(|l| view.line(l)).collect();
         let span = |pick: fn(&(f64, f64)) -> f64| {
             let values = flat.iter().map(pick);
