@@ -3,12 +3,15 @@
 //! Exit status: 0 done, 1 the tube or the machine said no, 2 the input or the arguments are unusable. Errors go
 //! to stderr, results to stdout; `--json` prints exactly one JSON object.
 
+mod check;
 mod convert;
 mod correct;
+mod demo;
 mod inspect;
 mod push;
 mod push_text;
 mod reconstruct;
+mod run;
 mod simulate;
 mod simulate_bender;
 
@@ -28,6 +31,12 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Shows the loop at work against simulated hardware, until a part is in tolerance.
+    Demo(demo::Args),
+    /// Runs the daemon: every cell of the configuration, until told to stop.
+    Run(run::Args),
+    /// Validates a configuration and everything that it names; connects to nothing.
+    Check(check::Args),
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
     /// Runs a simulator on its own.
@@ -79,6 +88,9 @@ pub enum Outcome {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let result: anyhow::Result<Outcome> = match cli.command {
+        Command::Demo(args) => demo::run(&args),
+        Command::Run(args) => run::run(&args),
+        Command::Check(args) => check::run(&args),
         Command::Reconstruct(args) => reconstruct::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Inspect(args) => inspect::run(&args),

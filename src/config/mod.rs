@@ -3,11 +3,13 @@
 //! A side door of the house: files come in here, checked values go to the rooms. [`Document`] is the one way
 //! in for every TOML file of the project (machine profiles too).
 
+mod daemon;
 mod document;
 mod materials;
 mod part;
 mod tables;
 
+pub use daemon::{CellConfig, DaemonConfig, Mode, ScanUnit, load_daemon, parse_daemon};
 pub use document::{ConfigError, Document};
 pub use materials::Materials;
 pub use part::{load_part, parse_part};
