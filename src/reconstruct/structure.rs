@@ -45,6 +45,9 @@ const JOINT_GAIN: f64 = 40.0;
 const JOINTS: usize = 3;
 const ROUNDS: usize = 40;
 
+/// A bend this much wider than the mean may be two.
+const WIDE: f64 = 1.3;
+
 /// Smallest first angle of a bend that is tried.
 const TRIAL_RAD: f64 = 0.01;
 
@@ -134,7 +137,9 @@ impl Jury<'_> {
         let joints = self.joints(best);
         let inserted = joints.iter().flat_map(|j| with_bend(model, j));
         let split = joints.iter().flat_map(|j| split(model, j));
-        let tried: Vec<TubeModel> = dropped.chain(merged).chain(inserted).chain(split).collect();
+        let doubled = (0..n).filter_map(|i| doubled(model, i));
+        let tried: Vec<TubeModel> =
+            dropped.chain(merged).chain(inserted).chain(split).chain(doubled).collect();
         tried
             .into_par_iter()
             .map(|m| self.judge(self.refit(best, &m)))
@@ -239,7 +244,8 @@ fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
         let mut out = model.clone();
         let share = ((joint.at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
         let whole = out.lra.bends[k / 2];
-        let length_mm = joint.shift_mm.clamp(0.1 * model.tube_radius_mm, segment.length_mm);
+        // At least a little apart, also where the bend itself is shorter than that.
+        let length_mm = joint.shift_mm.min(segment.length_mm).max(0.1 * model.tube_radius_mm);
         out.lra.bends[k / 2].angle_rad *= share;
         let angle_rad = whole.angle_rad * (1.0 - share);
         let rotation_rad = joint.turn_rad.x.clamp(-0.5, 0.5);
@@ -248,6 +254,22 @@ fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
         out
     };
     arcs.map(apart).collect()
+}
+
+/// A bend that is much wider than the others as two of the usual radius at its ends.
+fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
+    let whole = model.lra.bends[i];
+    let usual = mean_radius_mm(model)?;
+    if whole.radius_mm < WIDE * usual || whole.angle_rad <= 0.0 {
+        return None;
+    }
+    let mut out = model.clone();
+    let half = Bend { angle_rad: 0.5 * whole.angle_rad, radius_mm: usual, ..whole };
+    let between = (whole.radius_mm - usual) * whole.angle_rad;
+    out.lra.bends[i] = half;
+    out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
+    out.ovality_mm.insert(i, 0.0);
+    Some(out)
 }
 
 /// The tube with the shallow bend that a joint asks for. Where the joint lies on (or near the end of) an arc the
