@@ -176,7 +176,8 @@ fn bad_input_gives_one_clear_error_and_status_2() {
     not_a_number.extend_from_slice(b"nan 1 2\n");
     let mut text = xyz(&good);
     text.extend_from_slice(b"1.0 two 3.0\n");
-    let ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 5000\nproperty float x\nproperty float y\n\
+    let ply =
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 5000\nproperty float x\nproperty float y\n\
                 property float z\nend_header\n\x01\x02\x03";
     let cases: [(&str, Vec<u8>, &str); 8] = [
         ("empty.ply", Vec::new(), "empty"),
@@ -199,7 +200,8 @@ fn bad_input_gives_one_clear_error_and_status_2() {
 
 #[test]
 fn json_is_one_object_with_the_contracts_fields() {
-    let (status, out, error) = run("scan.xyz", &xyz(&scanned(6_000, 9).points), &["--json", "--nominal", PART]);
+    let (status, out, error) =
+        run("scan.xyz", &xyz(&scanned(6_000, 9).points), &["--json", "--nominal", PART]);
     assert_eq!((status, error.as_str()), (0, ""));
     let json: serde_json::Value = serde_json::from_str(&out).unwrap();
     for field in [
@@ -222,7 +224,9 @@ fn json_is_one_object_with_the_contracts_fields() {
     let bend = &json["bends"][1];
     for field in ["length", "rotation", "angle", "radius"] {
         let unit = if field == "length" || field == "radius" { "mm" } else { "deg" };
-        assert!(bend[format!("{field}_{unit}")].is_number() && bend[format!("{field}_sigma_{unit}")].is_number());
+        assert!(
+            bend[format!("{field}_{unit}")].is_number() && bend[format!("{field}_sigma_{unit}")].is_number()
+        );
     }
     assert_eq!(json["scan_sha256"].as_str().unwrap().len(), 64);
 }
