@@ -15,8 +15,9 @@ mod run;
 mod simulate;
 mod simulate_bender;
 
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Parser, Subcommand};
 
@@ -85,12 +86,26 @@ pub enum Outcome {
     Unknown,
 }
 
-/// Prints to stdout, a line at least, at once. Nobody reading it (`benderd ... | head`) is no reason to stop: `println!`
-/// would panic.
+/// Set when stdout took less than it was given.
+static OUTPUT_LOST: AtomicBool = AtomicBool::new(false);
+
+/// Prints to stdout, a line at least, at once. Nobody reading it (`benderd ... | head`) is no reason to stop, and
+/// `println!` would panic; anything else (a full disk) ends the program with status 2.
 fn say(text: &str) {
     let mut out = std::io::stdout().lock();
     let end = if text.ends_with('\n') { "" } else { "\n" };
-    let _ = write!(out, "{text}{end}").and_then(|()| out.flush());
+    if let Err(error) = write!(out, "{text}{end}").and_then(|()| out.flush())
+        && error.kind() != ErrorKind::BrokenPipe
+        && !OUTPUT_LOST.swap(true, Ordering::Relaxed)
+    {
+        eprintln!("error: the output cannot be written: {error}");
+    }
+}
+
+/// Whether an error only says that nobody reads the output any more.
+fn reader_gone(error: &anyhow::Error) -> bool {
+    let broken = |e: &std::io::Error| e.kind() == ErrorKind::BrokenPipe;
+    error.chain().any(|cause| cause.downcast_ref::<std::io::Error>().is_some_and(broken))
 }
 
 /// Runs the program's arguments.
@@ -108,9 +123,11 @@ pub fn main() -> ExitCode {
         Command::Push(args) => push::run(&args),
     };
     match result {
+        Ok(_) if OUTPUT_LOST.load(Ordering::Relaxed) => ExitCode::from(2),
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::No) => ExitCode::from(1),
         Ok(Outcome::Unknown) => ExitCode::from(3),
+        Err(error) if reader_gone(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::from(2)

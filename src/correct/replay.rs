@@ -150,6 +150,9 @@ fn oriented(job: &Job, part: &Part, model: &Model, turn: bool) -> Result<(Measur
         let text = format!("the commanded table is not this part's: {}", off.text);
         return Err(Reason::new(Code::Program, text));
     }
+    if let Some(text) = inspect::other_diameter(&part.measured, nominal) {
+        return Err(Reason::new(Code::WrongPart, format!("{text}: which part was scanned?")));
+    }
     let settled = part.measured.reversed.is_some();
     if part.measured.bends.len() != wanted {
         let seen = inspect::inspect(&part.measured, nominal).map_err(|e| unusable(e.to_string()))?;

@@ -98,12 +98,26 @@ pub struct Inspection {
     pub notes: Vec<String>,
 }
 
+/// A diameter that is off by more than this share is another tube's: mill tolerances are below one in a hundred.
+const OTHER_TUBE_SHARE: f64 = 0.05;
+
+/// Says so when the tube measured is not of the part's diameter.
+pub fn other_diameter(measured: &MeasuredTube, nominal: &Nominal) -> Option<String> {
+    let (found, wanted) = (2.0 * measured.tube_radius_mm, nominal.od_mm);
+    let other = (found - wanted).abs() > OTHER_TUBE_SHARE * wanted;
+    other.then(|| format!("the tube's diameter is {found:.2} mm, the part's is {wanted} mm"))
+}
+
 /// Inspects one measured tube. Rows of angle 0 in the nominal are merged first: no scan shows them.
 pub fn inspect(measured: &MeasuredTube, nominal: &Nominal) -> Result<Inspection, InspectError> {
     check(measured)?;
     let wanted = nominal.lra.merged();
     let mut out = empty(measured, nominal);
     let settled = measured.reversed.is_some();
+    if let Some(note) = other_diameter(measured, nominal) {
+        out.notes.push(note);
+        return Ok(decided(out, Verdict::WrongPart));
+    }
     if measured.bends.len() != wanted.bends.len() {
         out.notes.push(count_note(measured, &wanted, settled));
         return Ok(decided(out, Verdict::WrongPart));

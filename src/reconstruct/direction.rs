@@ -4,20 +4,40 @@ use nalgebra::{Point3, Vector3};
 
 use super::Reconstruction;
 use crate::tube::align::{Pair, register};
-use crate::tube::{Frame, Lra, Spine};
+use crate::tube::{Frame, Nominal, Spine};
 
 /// Places along the tube that are compared.
 const PLACES: usize = 100;
 
+/// A radius that is off by more than this share is another tube's.
+const OTHER_TUBE_SHARE: f64 = 0.05;
+
 /// The reconstruction in the direction in which it lies closer to the nominal.
-pub fn as_nominal(found: Reconstruction, nominal: &Lra) -> Reconstruction {
-    let wanted = places(&Spine::from_lra(nominal, Frame::identity()));
+pub fn as_nominal(found: Reconstruction, nominal: &Nominal) -> Reconstruction {
+    let wanted = places(&Spine::from_lra(&nominal.lra, Frame::identity()));
     let as_is = places(&found.spine);
     let turned: Vec<Point3<f64>> = as_is.iter().rev().copied().collect();
     let reversed = distance(&turned, &wanted) < distance(&as_is, &wanted);
     let mut out = if reversed { turn_round(found) } else { found };
     out.measured.reversed = Some(reversed);
+    out.measured.warnings.extend(doubts(&out, nominal));
     out
+}
+
+/// What speaks against this being the nominal's tube at all.
+fn doubts(found: &Reconstruction, nominal: &Nominal) -> Vec<String> {
+    let mut doubts = Vec::new();
+    let (bends, wanted) = (found.measured.bends.len(), nominal.lra.merged().bends.len());
+    if bends != wanted {
+        doubts.push(format!("{bends} bends found, the nominal has {wanted}: is this the part?"));
+    }
+    let (radius, wanted) = (found.measured.tube_radius_mm, nominal.od_mm / 2.0);
+    if (radius - wanted).abs() > OTHER_TUBE_SHARE * wanted {
+        doubts.push(format!(
+            "tube radius {radius:.2} mm, the nominal's is {wanted} mm: is this the part, in this unit?"
+        ));
+    }
+    doubts
 }
 
 fn places(spine: &Spine) -> Vec<Point3<f64>> {
@@ -40,7 +60,26 @@ fn turn_round(found: Reconstruction) -> Reconstruction {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tube::{Bend, MeasuredTube};
+    use crate::tube::{Alignment, Bend, Lra, Material, MeasuredTube, Tolerance};
+
+    fn part(lra: Lra, od_mm: f64) -> Nominal {
+        let material = Material {
+            key: "steel".to_owned(),
+            youngs_modulus_mpa: 2e5,
+            yield_mpa: 250.0,
+            strength_coefficient_mpa: 500.0,
+            hardening_exponent: 0.2,
+            usual_springback_rad: 0.03,
+        };
+        let tolerance = Tolerance {
+            envelope_mm: 1.0,
+            angle_rad: 0.01,
+            rotation_rad: 0.01,
+            length_mm: 0.5,
+            alignment: Alignment::BestFit,
+        };
+        Nominal { name: "part".to_owned(), od_mm, wall_mm: 1.0, material, die_clr_mm: 30.0, lra, tolerance }
+    }
 
     #[test]
     fn a_tube_scanned_from_its_other_end_is_turned_round() {
@@ -55,7 +94,9 @@ mod tests {
         let spine = Spine::from_lra(&lra, start);
         let measured = MeasuredTube::exact(&lra, 10.0);
         let found = Reconstruction { measured, spine: spine.clone(), lra, residuals_mm: Vec::new() };
-        let turned = as_nominal(found, &nominal);
+        let part = part(nominal.clone(), 25.0);
+        let turned = as_nominal(found, &part);
+        assert_eq!(turned.measured.warnings.len(), 1, "the bracket's radius is another: {turned:?}");
         assert_eq!(turned.measured.reversed, Some(true));
         assert_eq!(turned.lra, nominal);
         for k in 0..=20 {

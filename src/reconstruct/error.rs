@@ -51,6 +51,17 @@ pub enum ReconstructError {
         /// Most bends that are looked for.
         most: usize,
     },
+    /// The data does not say how far a bend turns.
+    #[error(
+        "the scan does not determine the angle of bend {bend} (its sigma would be {sigma_deg:.0} degrees); scan that \
+        part of the tube, more densely or with less noise"
+    )]
+    Undetermined {
+        /// Bend counted from 1, in the scan's order.
+        bend: usize,
+        /// Standard deviation that the angle would have.
+        sigma_deg: f64,
+    },
     /// The fitted tube does not explain the points.
     #[error(
         "only {used} of {points} points lie on the tube found (radius {radius_mm:.2} mm, {bends} bends); clear the scene or scan again"

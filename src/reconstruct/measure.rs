@@ -174,6 +174,8 @@ fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Ends {
     let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
     let last_frame = end_frame * back;
     let (first, final_end) = (look(0, &first_frame), look(last, &last_frame));
+    // The noise moves the outermost points along the tube too.
+    let noise_mm = fit.sigma_mm;
     let model = &mut fit.model;
     if let Some(end) = final_end {
         model.lra.last_length_mm -= end.at_mm;
@@ -185,8 +187,9 @@ fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Ends {
             None => model.lra.last_length_mm -= end.at_mm,
         }
     }
-    let place =
-        |frame: &Frame, end: Option<End>| end.map(|e| (frame * Point3::new(e.at_mm, 0.0, 0.0), e.sigma_mm));
+    let place = |frame: &Frame, end: Option<End>| {
+        end.map(|e| (frame * Point3::new(e.at_mm, 0.0, 0.0), e.sigma_mm.hypot(noise_mm)))
+    };
     Ends { first: place(&first_frame, first), last: place(&last_frame, final_end) }
 }
 

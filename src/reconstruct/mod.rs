@@ -55,8 +55,14 @@ const SPINE_SPACING_RADII: f64 = 0.3;
 /// Cell of the sample that decides the structure, in tube radii.
 const SAMPLE_CELL_RADII: f64 = 0.2;
 
+/// Share of the places of the cloud that must find a spine.
+const LEAST_SPINE_SHARE: f64 = 0.1;
+
 /// A second chain of this share of the longest is another tube, not debris.
 const SECOND_TUBE_SHARE: f64 = 0.15;
+
+/// An angle is never left open: a tube with one less certain than this was not measured.
+const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 
 /// Share of the points that must lie on the tube.
 const LEAST_USED_SHARE: f64 = 0.5;
@@ -67,13 +73,16 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     let radius_mm = radius::estimate(cloud).ok_or(ReconstructError::NoTube { points })?;
     let polygon = centre_line(cloud, radius_mm)?;
     let sample: Vec<Point3<f64>> = cloud.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
-    let chosen =
-        structure::choose(&polygon, &sample, radius_mm).ok_or_else(|| ReconstructError::NotBent {
-            length_mm: crust::length_mm(&polygon),
-            radius_mm,
-            most: structure::MOST_BENDS,
-        })?;
+    let not_bent = || ReconstructError::NotBent {
+        length_mm: crust::length_mm(&polygon),
+        radius_mm,
+        most: structure::MOST_BENDS,
+    };
+    let chosen = structure::choose(&polygon, &sample, radius_mm).ok_or_else(not_bent)?;
     let model = chosen.fit.model;
+    if structure::is_free_form(&model.lra, radius_mm) {
+        return Err(not_bent());
+    }
     let mut all = Sample::new(cloud.iter().collect(), &model);
     let mut best = fit(
         &mut all,
@@ -88,12 +97,16 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     let patch = best.model.tube_radius_mm;
     best.covariance *= evidence::correlation(&all, &best.model, patch, best.cutoff_mm, best.sigma_mm);
     let mut measured = measure::measure(&mut best, &mut all);
+    if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
+        let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
+        return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
+    }
     let residuals_mm = all.residuals(&best.model);
     let mut used: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
     let found = Reconstruction { measured, spine: best.model.spine(), lra: best.model.lra, residuals_mm };
     Ok(match options.nominal {
-        Some(nominal) => direction::as_nominal(found, &nominal.lra),
+        Some(nominal) => direction::as_nominal(found, nominal),
         None => found,
     })
 }
@@ -106,6 +119,9 @@ fn centre_line(cloud: &PointCloud, radius_mm: f64) -> Result<Vec<Point3<f64>>, R
     let mut found = crust::connect(&condensed, spacing, radius_mm);
     let lengths: Vec<f64> = found.chains.iter().map(|c| crust::solid_length_mm(c, spacing)).collect();
     let longest = lengths.first().copied().unwrap_or(0.0);
+    if (spine.len() as f64) < LEAST_SPINE_SHARE * cloud.thinned(spacing).len() as f64 {
+        return Err(ReconstructError::NoTube { points: cloud.len() });
+    }
     if longest < 2.0 * radius_mm {
         let wanted_mm = 0.2 * radius_mm;
         return Err(ReconstructError::TooSparse {

@@ -11,7 +11,7 @@ use super::fit::{Effort, Fit, RadiusPrior, fit};
 use super::model::TubeModel;
 use super::moments::Sample;
 use super::simplify::simplify;
-use crate::tube::{Bend, Segment};
+use crate::tube::{Bend, Lra, Segment};
 
 /// Tolerances of the polygon in tube radii; the spine's own shrinkage in bends is 0.038 (paper 000, section 3.2).
 const TOLERANCES: [f64; 4] = [0.03, 0.05, 0.08, 0.13];
@@ -21,6 +21,9 @@ const ARC_FACTOR: f64 = 2.5;
 
 /// More bends than this are a coil or a hose, not a bent tube.
 pub const MOST_BENDS: usize = 40;
+
+/// Seamless joints in one plane from which on a table is no bent tube's.
+const FREE_FORM_JOINTS: usize = 4;
 
 /// First cut-off of residuals in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
@@ -47,6 +50,9 @@ const JOINT_GAIN: f64 = 40.0;
 /// Joints tried per round, and rounds.
 const JOINTS: usize = 3;
 const ROUNDS: usize = 20;
+
+/// Pairs of bends tried as one per round.
+const PAIRS: usize = 4;
 
 /// A bend this much wider than the mean may be two.
 const WIDE: f64 = 1.3;
@@ -90,7 +96,7 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
             simplify(polygon, tolerance * radius_mm).into_iter().map(|i| polygon[i]).collect();
         let limits = Limits { tolerance_mm: ARC_FACTOR * tolerance * radius_mm, min_radius_mm: radius_mm };
         let Some((lra, start)) = approximate(&kept, limits) else { continue };
-        if lra.bends.len() > MOST_BENDS {
+        if lra.bends.len() > MOST_BENDS || is_free_form(&lra, radius_mm) {
             continue;
         }
         let model = TubeModel::round(start, lra, radius_mm);
@@ -145,7 +151,7 @@ impl Jury<'_> {
         let n = model.lra.bends.len();
         let dropped =
             (0..n).filter(|&i| model.lra.bends[i].angle_rad < DROP_RAD).map(|i| without_bend(model, i));
-        let merged = (1..n).filter_map(|i| merged(model, i));
+        let merged = likeliest_pairs(model).into_iter().filter_map(|i| merged(model, i));
         let joints = self.joints(best);
         let inserted = joints.iter().flat_map(|j| with_bend(model, j));
         let split = joints.iter().flat_map(|j| split(model, j));
@@ -223,6 +229,25 @@ fn turn_into_pose(model: &mut TubeModel) {
         model.start *= UnitQuaternion::from_axis_angle(&Vector3::x_axis(), first.rotation_rad);
         first.rotation_rad = 0.0;
     }
+}
+
+/// Bends that are likeliest one with the bend before: hardly a straight and hardly a turn between.
+fn likeliest_pairs(model: &TubeModel) -> Vec<usize> {
+    let bends = &model.lra.bends;
+    let apart =
+        |i: &usize| bends[*i].length_mm / model.tube_radius_mm + bends[*i].rotation_rad.abs() / MERGE_RAD;
+    let mut pairs: Vec<usize> = (1..bends.len()).collect();
+    pairs.sort_by(|a, b| apart(a).total_cmp(&apart(b)));
+    pairs.truncate(PAIRS);
+    pairs
+}
+
+/// Whether the table is a curve of no straights cut into arcs: bend on bend in one plane, which a bender would bend as
+/// one. Fewer than [`FREE_FORM_JOINTS`] such joints may be a measurement's doubt about one bend.
+pub fn is_free_form(lra: &Lra, tube_radius_mm: f64) -> bool {
+    let seamless = |b: &&Bend| b.length_mm < 0.2 * tube_radius_mm && b.rotation_rad.abs() < 0.3;
+    let joints = lra.bends.iter().skip(1).filter(seamless).count();
+    joints >= FREE_FORM_JOINTS && 2 * joints >= lra.bends.len()
 }
 
 /// Bends `i - 1` and `i` as one, when they turn in about one plane the same way.
