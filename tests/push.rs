@@ -226,6 +226,72 @@ async fn what_breaks_a_limit_is_refused_without_a_connection() {
     assert!(shop.untouched());
 }
 
+/// An answer of `benderd correct` with one reason.
+fn answer(verdict: &str) -> String {
+    format!(
+        r#"{{{verdict} "commanded": {{"bends": [
+            {{"length_mm": 120, "rotation_deg": 0, "angle_deg": 92.1}},
+            {{"length_mm": 150, "rotation_deg": 90, "angle_deg": 46.35}}], "last_length_mm": 100}},
+            "reasons": [{{"code": "outlier", "text": "bend 2 came out 3.1 deg off"}}]}}"#
+    )
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_verdict_of_a_correction_decides_whether_its_table_may_go() {
+    let shop = Shop::open(None).await;
+    for verdict in ["hold", "rescan"] {
+        shop.write("bracket.json", &answer(&format!("\"verdict\": {verdict:?},")));
+        for more in [&[][..], &["--dry-run"]] {
+            let output = shop.push("bracket.json", more).await;
+            assert_eq!(code(&output), 1, "{verdict} {more:?}: {}", stderr(&output));
+            let said = stderr(&output);
+            let expected =
+                [&format!("the correction's verdict is {verdict}:"), "bend 2 came out 3.1 deg off"];
+            assert!(expected.iter().all(|e| said.contains(*e)), "{said}");
+            assert_eq!(stdout(&output), "", "nobody was asked");
+        }
+        let output = shop.push("bracket.json", &["--json"]).await;
+        let report: Value = serde_json::from_str(&stdout(&output)).unwrap();
+        assert_eq!((code(&output), report["outcome"].as_str()), (1, Some("rejected")), "{report}");
+        assert_eq!(report["notes"][0], "bend 2 came out 3.1 deg off");
+    }
+    for verdict in ["\"verdict\": \"perhaps\",", "\"verdict\": null,", ""] {
+        shop.write("bracket.json", &answer(verdict));
+        let output = shop.push("bracket.json", &[]).await;
+        assert_eq!(code(&output), 2, "{verdict}: {}", stderr(&output));
+        assert!(stderr(&output).contains("bracket.json: not the JSON of `benderd correct"), "{verdict}");
+    }
+    assert!(shop.untouched() && !shop.path("journal.db").exists());
+
+    for verdict in ["first_piece", "correct", "in_tolerance"] {
+        shop.write("bracket.json", &answer(&format!("\"verdict\": {verdict:?},")));
+        let output = shop.push("bracket.json", &["--json"]).await;
+        assert_eq!(code(&output), 0, "{verdict}: {}", stderr(&output));
+        let report: Value = serde_json::from_str(&stdout(&output)).unwrap();
+        assert_eq!(report["notes"], serde_json::json!(["bend 2 came out 3.1 deg off"]));
+    }
+    assert!(shop.active().is_some());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn unusable_arguments_are_exit_2_and_reach_nobody() {
+    let shop = Shop::open(None).await;
+    for on in ["127.0.0.1", "127.0.0.1:0", "127.0.0.1:65536", ":502", "127.0.0.1:abc", ""] {
+        let output =
+            run(shop.folder.path(), &["push", "bracket.csv", "--bender", "quick.toml", "--on", on]).await;
+        assert_eq!(code(&output), 2, "{on}: {}", stderr(&output));
+        assert!(stderr(&output).contains("HOST:PORT with a port of 1 to 65535"), "{}", stderr(&output));
+    }
+    for program in ["", "  ", &"x".repeat(33), "B\u{fc}gel"] {
+        let output = shop.push("bracket.csv", &["--program", program]).await;
+        assert_eq!(code(&output), 2, "{program}: {}", stderr(&output));
+        assert!(stderr(&output).contains("allowed are 1 to 32 ASCII characters"), "{}", stderr(&output));
+    }
+    assert!(shop.untouched() && !shop.path("journal.db").exists());
+    let longest = shop.push("bracket.csv", &["--program", &"x".repeat(32)]).await;
+    assert_eq!(code(&longest), 1, "usable, but not what is loaded: {}", stderr(&longest));
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn unusable_input_is_exit_2_and_reaches_nobody() {
     let shop = Shop::open(None).await;
@@ -236,7 +302,7 @@ async fn unusable_input_is_exit_2_and_reaches_nobody() {
     shop.write("fold.csv", "x_mm,y_mm,z_mm,radius_mm\n0,0,0,\n100,0,0,50\n0,0,0,\n");
     shop.write("broken.json", "{\"commanded\": {\"bends\": [");
     shop.write("other.json", "{\"verdict\": \"correct\"}");
-    shop.write("angle.json", r#"{"commanded": {"bends": [{"length_mm": 1, "rotation_deg": 0, "angle_deg": 400}], "last_length_mm": 1}}"#);
+    shop.write("angle.json", r#"{"verdict": "correct", "commanded": {"bends": [{"length_mm": 1, "rotation_deg": 0, "angle_deg": 400}], "last_length_mm": 1}}"#);
     for (table, said) in [
         ("missing.csv", "missing.csv: cannot be read: No such file"),
         ("empty.csv", "empty.csv, line 1: header"),

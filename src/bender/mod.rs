@@ -29,6 +29,6 @@ pub use modbus::ModbusLink;
 pub use profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
 pub use wire::{
-    Ack, Staged, Status, TableId, commit_image, crc_of, decode_payload, decode_status, encode_payload,
-    payload_bytes, staging_image, status_span,
+    Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, decode_status,
+    encode_payload, payload_bytes, staging_image, status_span,
 };

@@ -10,7 +10,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use super::profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
-use crate::config::{ConfigError, Document};
+use crate::config::{ConfigError, Document, is_host_port};
 use crate::tube::MachineLimits;
 
 const SHIPPED: [(&str, &str); 1] =
@@ -381,10 +381,7 @@ fn text(doc: &Document, value: &Spanned<String>, key: &str, longest: usize) -> R
 
 fn endpoint(doc: &Document, value: &Spanned<String>) -> Result<String, ConfigError> {
     let found = value.get_ref();
-    let valid = found
-        .rsplit_once(':')
-        .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok_and(|p| p > 0));
-    if valid {
+    if is_host_port(found) {
         return Ok(found.clone());
     }
     Err(doc.value_error(value.span(), "endpoint", format!("{found:?}"), "host:port, port from 1 to 65535"))

@@ -262,6 +262,11 @@ fn u32_at(order: WordOrder, bytes: &[u8], at: usize) -> u32 {
     u32::from_be_bytes(order.arrange([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
 }
 
+/// Whether the machine can hold a program of this name.
+pub fn check_program(profile: &Profile, program: &str) -> Result<(), Reason> {
+    program_bytes(profile, program).map(drop)
+}
+
 fn program_bytes(profile: &Profile, program: &str) -> Result<Vec<u8>, Reason> {
     let longest = 2 * usize::from(profile.table.program_registers);
     let printable = |b: u8| b == b' ' || b.is_ascii_graphic();

@@ -14,6 +14,7 @@ mod event;
 mod intents;
 mod journalling;
 mod machine;
+mod places;
 mod setup;
 mod worker;
 

@@ -7,10 +7,11 @@ use thiserror::Error;
 use super::chain::Chain;
 use super::driver::{Craft, Identity};
 use super::event::Dwell;
+use super::places;
 use crate::arm::FolderSettings;
 use crate::bender::{Job, Profile, prepare};
 use crate::cloud::Unit;
-use crate::config::{CellConfig, ConfigError, Materials, ScanUnit, load_part};
+use crate::config::{CellConfig, ConfigError, DaemonConfig, Materials, ScanUnit, load_part};
 use crate::correct::Verdict;
 
 /// Why a cell cannot be set up.
@@ -30,6 +31,32 @@ pub enum SetupError {
         profile: String,
         /// Every reason.
         why: String,
+    },
+    /// It would be in the way of another cell or of the journal.
+    #[error(
+        "cell {cell} {key} = {found}, allowed is one of its own, neither around nor within another; {clash}"
+    )]
+    Shared {
+        /// The cell.
+        cell: String,
+        /// Name of the key.
+        key: &'static str,
+        /// Its value, folders with links followed.
+        found: String,
+        /// With whose.
+        clash: String,
+    },
+    /// A folder that the daemon needs is not one or cannot be written.
+    #[error("{what} = {folder}: {existing} is no folder that this user may write to: {cause}")]
+    Folder {
+        /// The key.
+        what: String,
+        /// Path as configured.
+        folder: String,
+        /// What exists of it.
+        existing: String,
+        /// What the system said.
+        cause: std::io::Error,
     },
 }
 
@@ -51,9 +78,21 @@ pub struct Setup {
 }
 
 impl Setup {
+    /// Loads all cells, and sees that none is in the way of another and that their folders can be used.
+    pub fn load_all(config: &DaemonConfig) -> Result<Vec<Setup>, SetupError> {
+        let materials = match &config.materials {
+            Some(path) => Materials::load(path)?,
+            None => Materials::shipped()?,
+        };
+        let setups =
+            config.cells.iter().map(|c| Setup::load(c, &materials)).collect::<Result<Vec<_>, _>>()?;
+        places::check(config)?;
+        Ok(setups)
+    }
+
     /// Loads what the cell names, and sees whether its machine can hold the part's first table. Connects to
     /// nothing.
-    pub fn load(config: &CellConfig, materials: &Materials) -> Result<Setup, SetupError> {
+    fn load(config: &CellConfig, materials: &Materials) -> Result<Setup, SetupError> {
         let nominal = load_part(&config.part, materials)?;
         let profile = Profile::load(&config.profile)?;
         let unit = match config.scan_unit {

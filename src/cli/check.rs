@@ -1,10 +1,12 @@
-//! `benderd check`: validates everything that `run` would load; connects to nothing.
+//! `benderd check`: validates everything that `run` would load; connects to nothing, makes nothing.
 
 use std::path::{Path, PathBuf};
 
+use anyhow::Context as _;
+
 use super::{Outcome, say};
 use crate::cell::Setup;
-use crate::config::{DaemonConfig, Materials, load_daemon};
+use crate::config::{DaemonConfig, load_daemon};
 
 /// Arguments of `benderd check`.
 #[derive(Debug, clap::Args)]
@@ -24,11 +26,7 @@ pub struct Loaded {
 /// Loads benderd.toml and all that it names.
 pub fn load(path: &Path) -> anyhow::Result<Loaded> {
     let config = load_daemon(path)?;
-    let materials = match &config.materials {
-        Some(path) => Materials::load(path)?,
-        None => Materials::shipped()?,
-    };
-    let setups = config.cells.iter().map(|c| Setup::load(c, &materials)).collect::<Result<Vec<_>, _>>()?;
+    let setups = Setup::load_all(&config).with_context(|| path.display().to_string())?;
     for setup in &setups {
         for warning in &setup.warnings {
             tracing::warn!(cell = setup.identity.name, "{warning}");

@@ -3,16 +3,17 @@
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, anyhow, bail};
 use serde::{Deserialize, Serialize};
 
 use super::{Outcome as Exit, push_text, say};
 use crate::bender::{
     ActiveTable, Bender as _, Intent, IntentLog as _, Job, ModbusLink, Outcome, Profile, Reason, TableId,
-    deliver, gate, prepare,
+    check_program, deliver, gate, prepare,
 };
 use crate::cell::JournalledIntents;
-use crate::config::{Table, read_table};
+use crate::config::{Table, is_host_port, read_table};
+use crate::correct::Verdict;
 use crate::journal::Journal;
 use crate::tube::{CommandTable, Lra};
 
@@ -25,7 +26,7 @@ pub struct Args {
     #[arg(long, value_name = "PROFILE")]
     bender: String,
     /// Where the machine is [default: the profile's endpoint].
-    #[arg(long, value_name = "HOST:PORT")]
+    #[arg(long, value_name = "HOST:PORT", value_parser = host_port)]
     on: Option<String>,
     /// The program that must be loaded [default: the table's file name without its ending].
     #[arg(long, value_name = "NAME")]
@@ -49,6 +50,8 @@ pub(super) struct Report {
     pub endpoint: String,
     pub program: String,
     pub dry_run: bool,
+    /// What the table's author had to say.
+    pub notes: Vec<String>,
     /// The table in force before; absent when the machine could not be read.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub active: Option<TableId>,
@@ -81,25 +84,52 @@ pub(super) enum Ending {
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Exit> {
     let profile = Profile::load(&args.bender)?;
-    let (table, notes) = read_commanded(&args.table)?;
+    let Commanded { table, notes, refusal } = read_commanded(&args.table)?;
     let program = match &args.program {
         Some(program) => program.clone(),
         None => args.table.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
     };
-    let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
+    check_program(&profile, &program)
+        .map_err(|reason| anyhow!("{reason}; give the machine's own with --program NAME"))?;
     let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
+    let mut report = Report {
+        bender: profile.name.clone(),
+        endpoint: endpoint.clone(),
+        program: program.clone(),
+        dry_run: args.dry_run,
+        notes,
+        active: None,
+        new: None,
+        result: Ending::WouldApply { outcome: "would_apply" },
+        resolved: None,
+        record: None,
+        journal: None,
+    };
+    if !refusal.is_empty() {
+        report.result = Ending::Delivered(Outcome::Rejected { reasons: refusal });
+        return finish(args, &report);
+    }
+    let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
+    report.journal = journal.as_ref().map(|j| j.file().to_owned());
     if !args.json {
-        notes.iter().for_each(|note| say(&format!("note      {note}\n")));
+        report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
     let job = Job { program, table, expected_active: None };
     let mut link = ModbusLink::new(profile, endpoint);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let report = runtime.block_on(push(args, &mut link, job, journal.as_mut()));
+    let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
+    finish(args, &report)
+}
+
+/// Says how it ended.
+fn finish(args: &Args, report: &Report) -> anyhow::Result<Exit> {
     if args.json {
-        say(&format!("{}\n", serde_json::to_string_pretty(&report)?));
+        say(&format!("{}\n", serde_json::to_string_pretty(report)?));
     } else {
-        let (out, err) = push_text::ending(&report);
-        say(&out);
+        let (out, err) = push_text::ending(report);
+        if !out.is_empty() {
+            say(&out);
+        }
         let _ = std::io::stderr().write_all(err.as_bytes());
     }
     Ok(match &report.result {
@@ -110,19 +140,13 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     })
 }
 
-async fn push(args: &Args, link: &mut ModbusLink, mut job: Job, journal: Option<&mut Journal>) -> Report {
-    let mut report = Report {
-        bender: link.profile().name.clone(),
-        endpoint: link.endpoint().to_owned(),
-        program: job.program.clone(),
-        dry_run: args.dry_run,
-        active: None,
-        new: None,
-        result: Ending::WouldApply { outcome: "would_apply" },
-        resolved: None,
-        record: None,
-        journal: journal.as_ref().map(|j| j.file().to_owned()),
-    };
+async fn push(
+    args: &Args,
+    link: &mut ModbusLink,
+    mut job: Job,
+    journal: Option<&mut Journal>,
+    mut report: Report,
+) -> Report {
     let look = look(link, &job).await;
     if let Ok(active) = &look {
         let active_id = active.status.active;
@@ -192,7 +216,7 @@ fn resolve(log: &mut JournalledIntents, active: &ActiveTable) -> Option<Outcome>
 /// What `benderd correct` printed, as far as it matters here.
 #[derive(Deserialize)]
 struct Corrected {
-    verdict: Option<String>,
+    verdict: Verdict,
     commanded: CommandTable,
     #[serde(default)]
     reasons: Vec<CorrectedReason>,
@@ -203,28 +227,53 @@ struct CorrectedReason {
     text: String,
 }
 
-/// The table of a file, with what its author had to say.
-fn read_commanded(path: &Path) -> anyhow::Result<(CommandTable, Vec<String>)> {
+/// What a file asks for.
+struct Commanded {
+    table: CommandTable,
+    /// What its author had to say.
+    notes: Vec<String>,
+    /// Why it must not be sent.
+    refusal: Vec<Reason>,
+}
+
+/// The table of a file, and whether its author lets it go.
+fn read_commanded(path: &Path) -> anyhow::Result<Commanded> {
     let name = path.display();
     if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
         let text = std::fs::read_to_string(path).with_context(|| format!("{name}: cannot be read"))?;
         let corrected: Corrected = serde_json::from_str(&text).with_context(|| {
-            format!("{name}: not the JSON of `benderd correct --json` (field \"commanded\")")
+            format!("{name}: not the JSON of `benderd correct --json` (fields \"verdict\" and \"commanded\")")
         })?;
         corrected.commanded.validate().with_context(|| name.to_string())?;
-        let verdict = corrected.verdict.filter(|v| v == "hold" || v == "rescan");
-        let notes = verdict.into_iter().map(|v| format!("the correction's verdict was {v:?}"));
-        return Ok((
-            corrected.commanded,
-            notes.chain(corrected.reasons.into_iter().map(|r| r.text)).collect(),
-        ));
+        let notes: Vec<String> = corrected.reasons.into_iter().map(|r| r.text).collect();
+        let refusal = refuse_verdict(corrected.verdict, &notes);
+        return Ok(Commanded { table: corrected.commanded, notes, refusal });
     }
     let lra = match read_table(path)? {
         Table::Lra(lra) => lra,
         Table::Ybc(ybc) => Lra::from(&ybc),
         Table::Xyz(polygon) => polygon.to_lra().with_context(|| name.to_string())?.0,
     };
-    Ok((CommandTable::from_lra(&lra), Vec::new()))
+    Ok(Commanded { table: CommandTable::from_lra(&lra), notes: Vec::new(), refusal: Vec::new() })
+}
+
+/// In hold and rescan the table of the answer is the one in force, not one to send.
+fn refuse_verdict(verdict: Verdict, notes: &[String]) -> Vec<Reason> {
+    let said = match verdict {
+        Verdict::FirstPiece | Verdict::Correct | Verdict::InTolerance => return Vec::new(),
+        Verdict::Hold => "the correction's verdict is hold: nothing is sent before this is cleared",
+        Verdict::Rescan => "the correction's verdict is rescan: scan the same tube again, then correct anew",
+    };
+    let texts = std::iter::once(said).chain(notes.iter().map(String::as_str));
+    texts.map(|text| Reason::new("verdict", None, text)).collect()
+}
+
+/// For clap: the form only, the host is looked up when connecting.
+fn host_port(text: &str) -> Result<String, String> {
+    match is_host_port(text) {
+        true => Ok(text.to_owned()),
+        false => Err("allowed is HOST:PORT with a port of 1 to 65535, for instance 192.168.1.20:502".into()),
+    }
 }
 
 /// The journal of a service is in its state directory, a person's in theirs.

@@ -133,8 +133,7 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         return Err(doc.value_error(raw.name.span(), "cell.name", format!("{name:?}"), allowed));
     }
     let address = raw.address.get_ref();
-    let port = address.rsplit_once(':').filter(|(host, _)| !host.is_empty());
-    if !port.is_some_and(|(_, port)| port.parse::<u16>().is_ok_and(|p| p > 0)) {
+    if !is_host_port(address) {
         let key = format!("cell {name} address");
         let allowed = "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\"";
         return Err(doc.value_error(raw.address.span(), &key, format!("{address:?}"), allowed));
@@ -153,6 +152,12 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         scan_unit: raw.scan.unit,
         settle_ms: (settle_s * 1000.0) as u64,
     })
+}
+
+/// Whether a text has the form `host:port` with a port of 1 to 65535; the host is not looked up.
+pub fn is_host_port(text: &str) -> bool {
+    text.rsplit_once(':')
+        .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok_and(|p| p > 0))
 }
 
 /// What looks like a file is one; any other word is a built-in profile's name.

@@ -1,0 +1,101 @@
+//! Where the cells of one configuration are: no two at one machine or in one folder, however either is written,
+//! and no folder that the daemon could not use.
+//!
+//! `config` compares what is written and does no I/O; here names are looked up and links followed. Nothing is
+//! made and nothing left behind, so that `benderd check` may do it.
+
+use std::collections::BTreeSet;
+use std::net::ToSocketAddrs;
+use std::path::{Component, Path, PathBuf};
+
+use super::setup::SetupError;
+use crate::config::{CellConfig, DaemonConfig};
+
+/// Refuses cells in each other's way, and folders that cannot be used by whoever asks.
+pub fn check(config: &DaemonConfig) -> Result<(), SetupError> {
+    for (i, cell) in config.cells.iter().enumerate() {
+        config.cells[..i].iter().try_for_each(|other| refuse_sharing(cell, other))?;
+        refuse_journal_among_scans(cell, &config.state_dir)?;
+    }
+    usable("state_dir", &config.state_dir)?;
+    for cell in &config.cells {
+        let what = format!("cell {} scan.folder", cell.name);
+        let folder = &cell.scan_folder;
+        [folder.clone(), folder.join("done"), folder.join("failed")]
+            .iter()
+            .try_for_each(|f| usable(&what, f))?;
+    }
+    Ok(())
+}
+
+fn refuse_sharing(cell: &CellConfig, other: &CellConfig) -> Result<(), SetupError> {
+    let refuse = |key, found: String, theirs: String| {
+        let clash = format!("cell {} has {theirs}", other.name);
+        Err(SetupError::Shared { cell: cell.name.clone(), key, found, clash })
+    };
+    if !machines(&cell.address).is_disjoint(&machines(&other.address)) {
+        let theirs = format!("the same machine as {:?}", other.address);
+        return refuse("address", format!("{:?}", cell.address), theirs);
+    }
+    let (ours, theirs) = (real_path(&cell.scan_folder), real_path(&other.scan_folder));
+    if ours.starts_with(&theirs) || theirs.starts_with(&ours) {
+        return refuse("scan.folder", ours.display().to_string(), theirs.display().to_string());
+    }
+    Ok(())
+}
+
+/// The journal would be taken for a scan and moved away. Scan folders within the state folder are usual: the
+/// systemd unit lets the daemon write nowhere else.
+fn refuse_journal_among_scans(cell: &CellConfig, state_dir: &Path) -> Result<(), SetupError> {
+    let (scans, state) = (real_path(&cell.scan_folder), real_path(state_dir));
+    if !state.starts_with(&scans) {
+        return Ok(());
+    }
+    Err(SetupError::Shared {
+        cell: cell.name.clone(),
+        key: "scan.folder",
+        found: scans.display().to_string(),
+        clash: format!("state_dir {} is in it", state.display()),
+    })
+}
+
+/// Every machine that an address may mean, and the address itself: a name may be unknown while the network is
+/// down.
+fn machines(address: &str) -> BTreeSet<String> {
+    let mut all = BTreeSet::new();
+    if let Some((host, port)) = address.rsplit_once(':') {
+        let host = host.to_ascii_lowercase();
+        let port = port.parse().unwrap_or(0_u16);
+        all.insert(format!("{}:{port}", host.trim_end_matches('.')));
+    }
+    let found = address.to_socket_addrs().into_iter().flatten();
+    all.extend(found.map(|a| format!("{}:{}", a.ip().to_canonical(), a.port())));
+    all
+}
+
+/// Absolute, links followed as far as the path exists; the rest as `create_dir_all` would make it.
+fn real_path(path: &Path) -> PathBuf {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let mut real = PathBuf::new();
+    for component in absolute.components() {
+        if component == Component::ParentDir {
+            real.pop();
+        } else {
+            real.push(component);
+            real = real.canonicalize().unwrap_or(real);
+        }
+    }
+    real
+}
+
+/// What exists of the folder's path must be a folder that takes a file: one without a name, gone when closed.
+fn usable(what: &str, folder: &Path) -> Result<(), SetupError> {
+    let real = real_path(folder);
+    let existing = real.ancestors().find(|p| p.symlink_metadata().is_ok()).unwrap_or(&real);
+    tempfile::tempfile_in(existing).map(drop).map_err(|cause| SetupError::Folder {
+        what: what.to_owned(),
+        folder: folder.display().to_string(),
+        existing: existing.display().to_string(),
+        cause,
+    })
+}

@@ -1,0 +1,100 @@
+//! `benderd check` says no where `benderd run` would, and leaves nothing behind.
+
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
+use std::path::Path;
+
+use assert_cmd::Command;
+
+/// A configuration in `dir` of one cell per (address, scan folder).
+fn write_config(dir: &Path, state_dir: &str, cells: &[(&str, &str)]) {
+    let part = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/parts/bracket-17.toml");
+    let mut text = format!("version = 1\nstate_dir = {state_dir:?}\n");
+    for (i, (address, folder)) in cells.iter().enumerate() {
+        text += &format!(
+            "[[cell]]\nname = \"b{}\"\nmode = \"observe\"\npart = {part:?}\nprofile = \"reference-modbus\"\n\
+             address = {address:?}\n[cell.scan]\nfolder = {folder:?}\n",
+            i + 1
+        );
+    }
+    std::fs::write(dir.join("benderd.toml"), text).unwrap();
+}
+
+fn benderd(dir: &Path, args: &[&str]) -> (i32, String) {
+    let output = Command::cargo_bin("benderd").unwrap().current_dir(dir).args(args).output().unwrap();
+    (output.status.code().unwrap(), String::from_utf8(output.stderr).unwrap())
+}
+
+/// Both refuse, for the same reason.
+fn refused(dir: &Path, said: &str) {
+    for args in [&["check", "benderd.toml"][..], &["run", "--config", "benderd.toml"]] {
+        let (code, err) = benderd(dir, args);
+        assert!(code == 2 && err.contains(said), "{args:?}: exit {code}, {err}\nshould say {said}");
+    }
+}
+
+#[test]
+fn one_machine_written_in_two_ways_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    for (one, other) in [
+        ("127.0.0.1:502", "127.0.0.1:0502"),
+        ("no-such-bender.invalid:502", "No-Such-Bender.INVALID:502"),
+        ("127.0.0.1:502", "localhost:502"),
+        ("127.0.0.1:502", "[::ffff:127.0.0.1]:502"),
+    ] {
+        write_config(dir.path(), "state", &[(one, "s1"), (other, "s2")]);
+        refused(dir.path(), &format!("cell b2 address = {other:?}"));
+    }
+    write_config(dir.path(), "state", &[("127.0.0.1:502", "s1"), ("127.0.0.1:503", "s2")]);
+    assert_eq!(benderd(dir.path(), &["check", "benderd.toml"]), (0, String::new()));
+}
+
+#[test]
+fn one_folder_written_in_two_ways_and_folders_in_each_other_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(dir.path().join("real")).unwrap();
+    std::os::unix::fs::symlink("real", dir.path().join("link")).unwrap();
+    for (one, other) in [
+        ("real", "link"),
+        ("real/new", "link/new"),
+        ("real", "missing/../link"),
+        ("real", "real/../real/."),
+        ("real", "link/done"),
+        ("real/b1/deep", "real/b1"),
+    ] {
+        write_config(dir.path(), "state", &[("127.0.0.1:502", one), ("127.0.0.1:503", other)]);
+        refused(dir.path(), "cell b2 scan.folder = ");
+    }
+    for state_dir in ["link", "real/failed"] {
+        write_config(dir.path(), state_dir, &[("127.0.0.1:502", "real")]);
+        refused(dir.path(), "cell b1 scan.folder = ");
+    }
+    // Neighbours whose names begin alike, within the state folder as the shipped configuration has them.
+    let cells = [("127.0.0.1:502", "state/s1"), ("127.0.0.1:503", "state/s11")];
+    write_config(dir.path(), "state", &cells);
+    assert_eq!(benderd(dir.path(), &["check", "benderd.toml"]), (0, String::new()));
+    assert!(!dir.path().join("state").exists(), "a check makes nothing");
+}
+
+#[test]
+fn a_folder_that_cannot_be_used_is_refused_by_the_check_already() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(dir.path().join("scans")).unwrap();
+    std::fs::write(dir.path().join("file"), "").unwrap();
+    std::fs::write(dir.path().join("scans/done"), "").unwrap();
+    std::os::unix::fs::symlink("nowhere", dir.path().join("dangling")).unwrap();
+    // Not even root may write to /proc.
+    for (state_dir, folder, key) in [
+        ("file", "s", "state_dir = file"),
+        ("file/state", "s", "state_dir = file/state"),
+        ("/proc/benderd", "s", "state_dir = /proc/benderd"),
+        ("state", "file", "cell b1 scan.folder = file"),
+        ("state", "dangling", "cell b1 scan.folder = dangling"),
+        ("state", "scans", "cell b1 scan.folder = scans/done"),
+        ("state", "/proc/scans", "cell b1 scan.folder = /proc/scans"),
+    ] {
+        write_config(dir.path(), state_dir, &[("127.0.0.1:502", folder)]);
+        refused(dir.path(), key);
+    }
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 4, "three of ours and the configuration");
+}
