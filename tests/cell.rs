@@ -278,6 +278,13 @@ fn a_cell_comes_up_disarmed_and_writes_nothing_until_armed() {
 }
 
 #[test]
+fn an_order_to_arm_is_not_lost_while_the_machine_is_first_read() {
+    let mut b = Bench::at(Mode::Automatic, "Reading(Contact)").unwrap();
+    b.on(Event::Arm);
+    assert!(matches!(b.read(1)[..], [Action::Decide(_)]));
+}
+
+#[test]
 fn observing_never_delivers() {
     for verdict in
         [Verdict::FirstPiece, Verdict::Correct, Verdict::InTolerance, Verdict::Hold, Verdict::Rescan]
