@@ -4,6 +4,8 @@
 //! once at most and never before an equal read-back and a journalled intent, and the outcome is true, also a
 //! while later. The same seed gives the same run.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::collections::BTreeMap;
 
 use benderd::bender::{
@@ -65,6 +67,12 @@ impl World {
         let profile = Profile::load("reference-modbus").unwrap();
         let mut machine = MachineModel::new(profile.clone(), "P1", BENDS as u16);
         machine.edit_at_screen(encode_payload(&profile, "P1", &table(&mut rng)).unwrap());
+        if rng.random_bool(0.5) {
+            // The refusal of an earlier attempt at the next revision still stands in the acknowledgement.
+            let id = TableId { revision: machine.active().revision + 1, crc: 0 };
+            machine.write(profile.registers.commit, &words(&commit_image(&profile, id))).unwrap();
+            assert!(matches!(machine.tick(), Some(MachineEvent::Refused { .. })));
+        }
         let job = Job { program: "P1".into(), table: table(&mut rng), expected_active: None };
         let meant = BTreeMap::from([(machine.active(), machine.active_payload())]);
         let world = World {

@@ -1,5 +1,7 @@
 //! `benderd convert` as a user runs it: all ways, and the ways that cannot be.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::fs;
 use std::path::Path;
 

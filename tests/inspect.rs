@@ -1,12 +1,16 @@
 //! Inspection as a user relies on it: what is accepted, what is refused, and what is said about it.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 mod common;
 
 use std::fs;
 
 use assert_cmd::Command;
+use benderd::cloud::write_scan;
 use benderd::config::{Document, Materials, parse_part};
 use benderd::inspect::{Inspection, Place, State, Verdict, inspect, judge};
+use benderd::sim::scan::{self, Density, ScanSettings, TubeShape};
 use benderd::tube::{Alignment, Bend, Lra, MeasuredTube, Nominal};
 use common::measured;
 use proptest::prelude::*;
@@ -135,6 +139,28 @@ fn angles_are_judged_with_a_guard_band() {
     assert_eq!(judge(0.5 - 2.0 * 0.125 + 1e-9, 0.5, 0.125), State::Uncertain);
     assert_eq!(judge(-0.75, 0.5, 0.125), State::Uncertain);
     assert_eq!(judge(-0.75 - 1e-9, 0.5, 0.125), State::Out);
+}
+
+#[test]
+fn a_doubtful_length_or_turn_leaves_the_decision_to_the_check_points() {
+    // Found in the loop with simulated scans: an end known to 0.2 mm, off by 0.5 where 0.8 is allowed.
+    let mut tube = bracket().lra;
+    tube.bends[0].length_mm -= 0.5;
+    let mut scan = measured(&tube, 0.02);
+    scan.intersection_sigma_mm[0] = Some(0.2);
+    let found = inspect(&scan, &bracket()).unwrap();
+    assert_eq!(found.bends[0].length_mm.state, Some(State::Uncertain));
+    assert_eq!(found.verdict, Verdict::InTolerance, "{}", found.advice);
+    // Out for certain is out, though every check point is within 1.5 mm.
+    tube.bends[0].length_mm -= 0.5;
+    let found = inspect(&measured(&tube, 0.02), &bracket()).unwrap();
+    assert!(found.points.iter().all(|p| p.state == State::In));
+    assert_eq!(found.verdict, Verdict::OutOfTolerance);
+    assert!(
+        found.advice.contains("length of straight 1 is off by -1.00 (tolerance 0.8)"),
+        "{}",
+        found.advice
+    );
 }
 
 /// The same corners with other radii.
@@ -376,6 +402,25 @@ fn the_command_prints_a_table_and_a_verdict() {
     let value: serde_json::Value = serde_json::from_str(&text).unwrap();
     assert_eq!((code, value["verdict"].as_str()), (Some(1), Some("out_of_tolerance")));
     assert!((value["bends"][1]["angle_deg"]["deviation"].as_f64().unwrap() + 2.0).abs() < 1e-9);
+}
+
+#[test]
+fn the_command_inspects_a_scan() {
+    let dir = tempfile::tempdir().unwrap();
+    let part = concat!(env!("CARGO_MANIFEST_DIR"), "/config/parts/bracket-17.toml");
+    let file = dir.path().join("scan.ply");
+    let mut tube = bracket().lra;
+    tube.bends[1].angle_rad -= 2.0_f64.to_radians();
+    let shape = TubeShape::round(tube.reversed(), 25.4);
+    let settings = ScanSettings { density: Density::Points(30_000), views: 2, ..ScanSettings::default() };
+    write_scan(&file, &scan::scan(&shape, &settings, 1).cloud()).unwrap();
+    let mut command = Command::cargo_bin("benderd").unwrap();
+    let out = command.arg("inspect").arg(&file).args(["--nominal", part, "--json"]).output().unwrap();
+    assert_eq!(out.status.code(), Some(1), "{}", String::from_utf8_lossy(&out.stderr));
+    let found: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(found["verdict"], "out_of_tolerance");
+    let off = found["bends"][1]["angle_deg"]["deviation"].as_f64().unwrap();
+    assert!((off + 2.0).abs() < 0.1, "{found}");
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! The tube vocabulary against published pipes, brute force and its own symmetries; part files against mistakes.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::f64::consts::PI;
 use std::path::Path;
 

@@ -285,56 +285,71 @@ fn parse_deadlines(doc: &Document, raw: &RawDeadlines) -> Result<Deadlines, Conf
     Ok(deadlines)
 }
 
+/// One group of registers: the address as written in the file, its key, how many.
+struct Area<'a> {
+    address: &'a Spanned<i64>,
+    key: &'static str,
+    registers: usize,
+}
+
+impl Area<'_> {
+    fn start(&self) -> i64 {
+        *self.address.get_ref()
+    }
+
+    fn end(&self) -> i64 {
+        self.start() + self.registers as i64
+    }
+
+    fn complaint(&self, doc: &Document, allowed: String) -> ConfigError {
+        doc.value_error(self.address.span(), &format!("registers.{}", self.key), self.start(), allowed)
+    }
+}
+
+fn areas<'a>(r: &'a RawRegisters, profile: &Profile) -> Vec<Area<'a>> {
+    let payload = (profile.payload_header_bytes() + profile.limits.max_bends * Profile::ROW_BYTES) / 2;
+    let area = |address, key, registers| Area { address, key, registers };
+    vec![
+        area(&r.identification, "identification", 2),
+        area(&r.layout, "layout", 1),
+        area(&r.heartbeat, "heartbeat", 1),
+        area(&r.state, "state", 1),
+        area(&r.bend_count, "bend_count", 1),
+        area(&r.program, "program", usize::from(profile.table.program_registers)),
+        area(&r.active_revision, "active_revision", 2),
+        area(&r.active_crc, "active_crc", 2),
+        area(&r.ack_revision, "ack_revision", 2),
+        area(&r.ack_code, "ack_code", 1),
+        area(&r.commit, "commit", 4),
+        area(&r.staging, "staging", 4 + payload),
+        area(&r.active, "active", payload),
+    ]
+}
+
 /// No two areas overlap, all fit, and one read covers the status.
 fn check_areas(doc: &Document, raw: &RawProfile, profile: &Profile) -> Result<(), ConfigError> {
-    let r = &raw.registers;
-    let payload = (profile.payload_header_bytes() + profile.limits.max_bends * Profile::ROW_BYTES) / 2;
-    let program = usize::from(profile.table.program_registers);
-    let mut areas = [
-        (&r.identification, "identification", 2),
-        (&r.layout, "layout", 1),
-        (&r.heartbeat, "heartbeat", 1),
-        (&r.state, "state", 1),
-        (&r.bend_count, "bend_count", 1),
-        (&r.program, "program", program),
-        (&r.active_revision, "active_revision", 2),
-        (&r.active_crc, "active_crc", 2),
-        (&r.ack_revision, "ack_revision", 2),
-        (&r.ack_code, "ack_code", 1),
-        (&r.commit, "commit", 4),
-        (&r.staging, "staging", 4 + payload),
-        (&r.active, "active", payload),
-    ];
-    areas.sort_by_key(|(start, _, _)| *start.get_ref());
-    let end = |area: &(&Spanned<i64>, &str, usize)| *area.0.get_ref() + area.2 as i64;
-    for area in &areas {
-        if end(area) > 0x10000 {
-            let allowed = format!("at most {}: it takes {} registers", 0x10000 - area.2, area.2);
-            let key = format!("registers.{}", area.1);
-            return Err(doc.value_error(area.0.span(), &key, area.0.get_ref(), allowed));
-        }
+    let mut areas = areas(&raw.registers, profile);
+    areas.sort_by_key(Area::start);
+    if let Some(area) = areas.iter().find(|a| a.end() > 0x10000) {
+        let allowed = format!("at most {}: it takes {} registers", 0x10000 - area.registers, area.registers);
+        return Err(area.complaint(doc, allowed));
     }
-    for pair in areas.windows(2) {
-        if end(&pair[0]) > *pair[1].0.get_ref() {
-            let allowed = format!("{} or more: {} ends there", end(&pair[0]), pair[0].1);
-            let key = format!("registers.{}", pair[1].1);
-            return Err(doc.value_error(pair[1].0.span(), &key, pair[1].0.get_ref(), allowed));
-        }
+    if let Some((before, area)) = areas.iter().zip(areas.iter().skip(1)).find(|(a, b)| a.end() > b.start()) {
+        return Err(area.complaint(doc, format!("{} or more: {} ends there", before.end(), before.key)));
     }
-    let status = areas.iter().filter(|a| !matches!(a.1, "staging" | "active"));
-    let first = status.clone().map(|a| *a.0.get_ref()).min().unwrap_or(0);
-    for area in status {
-        if end(area) - first > i64::from(profile.modbus.max_read_registers) {
+    let mut status = areas.iter().filter(|a| !matches!(a.key, "staging" | "active"));
+    let first = status.clone().map(Area::start).min().unwrap_or(0);
+    let most = profile.modbus.max_read_registers;
+    match status.find(|a| a.end() - first > i64::from(most)) {
+        Some(area) => {
             let allowed = format!(
-                "below {}: one read of {} registers covers the whole status, so that it is of one moment",
-                first + i64::from(profile.modbus.max_read_registers),
-                profile.modbus.max_read_registers
+                "below {}: one read of {most} registers covers the whole status, so that it is of one moment",
+                first + i64::from(most) - area.registers as i64 + 1
             );
-            let key = format!("registers.{}", area.1);
-            return Err(doc.value_error(area.0.span(), &key, area.0.get_ref(), allowed));
+            Err(area.complaint(doc, allowed))
         }
+        None => Ok(()),
     }
-    Ok(())
 }
 
 fn integer(

@@ -43,9 +43,10 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         Some(path) => store::load(path)?,
         None => Knowledge::default(),
     };
-    let answer = step(&nominal, &history, &known, &Limits::default());
+    let limits = Limits::default();
+    let answer = step(&nominal, &history, &known, &limits);
     if let Some(path) = &args.knowledge {
-        let learned = learn(&nominal, &history, &known);
+        let learned = learn(&nominal, &history, &known, &limits);
         if learned != known {
             store::save(path, &learned)?;
         }

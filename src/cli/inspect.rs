@@ -1,22 +1,27 @@
 //! `benderd inspect`: one measured tube against its part; a table for people or one JSON object.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 
-use super::Outcome;
+use super::{Outcome, ScanUnit};
+use crate::cloud::read_scan;
 use crate::config::{Materials, load_part};
 use crate::inspect::{Comparison, Inspection, Place, State, Verdict, inspect};
-use crate::tube::MeasuredTube;
+use crate::reconstruct::{Options, reconstruct};
+use crate::tube::{MeasuredTube, Nominal};
 
 /// Arguments of `benderd inspect`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// What `benderd reconstruct --json` printed (.json).
+    /// The scan, or what `benderd reconstruct --json` printed of it (.json).
     scan: PathBuf,
     /// The part file.
-    #[arg(long)]
+    #[arg(long, value_name = "PART")]
     nominal: PathBuf,
+    /// Unit of the scan's coordinates.
+    #[arg(long, value_enum, default_value_t)]
+    unit: ScanUnit,
     /// Materials file instead of the built-in one.
     #[arg(long)]
     materials: Option<PathBuf>,
@@ -32,7 +37,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         None => Materials::shipped()?,
     };
     let nominal = load_part(&args.nominal, &materials)?;
-    let measured = read_measured(&args.scan)?;
+    let measured = measured(args, &nominal)?;
     let inspection = inspect(&measured, &nominal).with_context(|| args.scan.display().to_string())?;
     if args.json {
         println!("{}", serde_json::to_string(&inspection)?);
@@ -42,10 +47,20 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     Ok(if inspection.verdict == Verdict::InTolerance { Outcome::Done } else { Outcome::No })
 }
 
-fn read_measured(path: &Path) -> anyhow::Result<MeasuredTube> {
-    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    serde_json::from_str(&text)
-        .with_context(|| format!("{}: not what `reconstruct --json` prints", path.display()))
+fn measured(args: &Args, nominal: &Nominal) -> anyhow::Result<MeasuredTube> {
+    let file = args.scan.display();
+    if args.scan.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) {
+        let text = std::fs::read_to_string(&args.scan).with_context(|| file.to_string())?;
+        return serde_json::from_str(&text)
+            .with_context(|| format!("{file}: not what `reconstruct --json` prints"));
+    }
+    let scan = read_scan(&args.scan, args.unit.into())?;
+    let found =
+        reconstruct(&scan.cloud, &Options { nominal: Some(nominal) }).with_context(|| file.to_string())?;
+    let mut measured = found.measured;
+    measured.scan_sha256 = scan.sha256;
+    measured.warnings.extend(scan.notes);
+    Ok(measured)
 }
 
 fn table(inspection: &Inspection) -> String {

@@ -39,6 +39,8 @@ enum Command {
     Check(check::Args),
     /// Reconstructs the tube in one scan: LRA with uncertainties.
     Reconstruct(reconstruct::Args),
+    /// Runs a simulator on its own.
+    Simulate(simulate::Args),
     /// Compares a measured tube with its part: deviations and verdict.
     Inspect(inspect::Args),
     /// One step of the correction loop: from what was measured to the next table.
@@ -47,9 +49,6 @@ enum Command {
     Convert(convert::Args),
     /// Delivers one table to a bender by hand: stage, verify, commit.
     Push(push::Args),
-    /// Simulators on their own.
-    #[command(subcommand)]
-    Simulate(simulate::Simulate),
 }
 
 /// Units in which scan files come.
@@ -93,11 +92,11 @@ pub fn main() -> ExitCode {
         Command::Run(args) => run::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Reconstruct(args) => reconstruct::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Correct(args) => correct::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Push(args) => push::run(&args),
-        Command::Simulate(what) => simulate::run(&what),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

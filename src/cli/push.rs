@@ -1,5 +1,6 @@
 //! `benderd push`: delivers one table by hand, through the same gate and handshake as the daemon.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
@@ -88,16 +89,18 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
     let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
     if !args.json {
-        notes.iter().for_each(|note| println!("note      {note}"));
+        notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
     let job = Job { program, table, expected_active: None };
     let mut link = ModbusLink::new(profile, endpoint);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut()));
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        say(&format!("{}\n", serde_json::to_string_pretty(&report)?));
     } else {
-        push_text::ending(&report);
+        let (out, err) = push_text::ending(&report);
+        say(&out);
+        let _ = std::io::stderr().write_all(err.as_bytes());
     }
     Ok(match &report.result {
         Ending::WouldApply { .. } => Exit::Done,
@@ -105,6 +108,12 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         Ending::Delivered(Outcome::Rejected { .. } | Outcome::NotApplied { .. }) => Exit::No,
         Ending::Delivered(Outcome::Unknown { .. }) => Exit::Unknown,
     })
+}
+
+/// To stdout; a delivery goes on when nobody reads what is said (`println!` would panic).
+fn say(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
 async fn push(args: &Args, link: &mut ModbusLink, mut job: Job, journal: Option<&mut Journal>) -> Report {
@@ -131,7 +140,7 @@ async fn push(args: &Args, link: &mut ModbusLink, mut job: Job, journal: Option<
             report.new = Some(TableId { revision, crc: prepared.crc });
         }
         if !args.json {
-            push_text::comparison(link.profile(), &report, &job, active);
+            say(&push_text::comparison(link.profile(), &report, &job, active));
         }
     }
     let Some(journal) = journal else {
@@ -180,7 +189,7 @@ fn resolve(log: &mut JournalledIntents, active: &ActiveTable) -> Option<Outcome>
     match log.resolve(active.status.active) {
         Ok(resolved) => resolved,
         Err(error) => {
-            eprintln!("warning: an open delivery could not be looked up: {error}");
+            let _ = writeln!(std::io::stderr(), "warning: an open delivery could not be looked up: {error}");
             None
         }
     }

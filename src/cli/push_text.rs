@@ -5,23 +5,25 @@ use crate::bender::{ActiveTable, Job, Outcome, Profile, decode_payload, encode_p
 use crate::tube::CommandTable;
 
 /// The machine, and the table in force beside the new one, both as the machine holds them.
-pub fn comparison(profile: &Profile, report: &Report, job: &Job, active: &ActiveTable) {
+pub fn comparison(profile: &Profile, report: &Report, job: &Job, active: &ActiveTable) -> String {
     let status = &active.status;
-    println!("bender    {} at {}", report.bender, report.endpoint);
-    println!("loaded    program {:?} with {} bends", status.program, status.bend_count);
     let on = profile.state_bits.iter().filter(|b| status.state >> b.bit & 1 == 1);
     let names = on.map(|b| b.name.as_str()).collect::<Vec<_>>().join(", ");
-    println!("state     0x{:04X}: {}", status.state, if names.is_empty() { "nothing" } else { &names });
-    println!("active    {}", status.active);
+    let mut out = format!("bender    {} at {}\n", report.bender, report.endpoint);
+    out += &format!("loaded    program {:?} with {} bends\n", status.program, status.bend_count);
+    out +=
+        &format!("state     0x{:04X}: {}\n", status.state, if names.is_empty() { "nothing" } else { &names });
+    out += &format!("active    {}\n", status.active);
     if let Some(new) = report.new {
-        println!("new       {new}, for program {:?}", report.program);
+        out += &format!("new       {new}, for program {:?}\n", report.program);
     }
     let now = decode_payload(profile, &active.payload).map(|(_, table)| table).unwrap_or_default();
     let rounded = encode_payload(profile, &job.program, &job.table)
         .ok()
         .and_then(|payload| decode_payload(profile, &payload).ok());
-    if let Some((_, new)) = rounded {
-        print!("{}", side_by_side(&now, &new));
+    match rounded {
+        Some((_, new)) => out + &side_by_side(&now, &new),
+        None => out,
     }
 }
 
@@ -51,38 +53,42 @@ fn side_by_side(now: &CommandTable, new: &CommandTable) -> String {
     out.lines().map(|line| format!("{}\n", line.trim_end())).collect::<String>() + "\n"
 }
 
-/// The last lines: results to stdout, refusals to stderr.
-pub fn ending(report: &Report) {
+/// The last lines: what was done for stdout, refusals and warnings for stderr.
+pub fn ending(report: &Report) -> (String, String) {
+    let (mut out, mut err) = (String::new(), String::new());
     if let Some(resolved) = &report.resolved {
-        println!("earlier   a delivery whose outcome was open is decided now: {}", one_line(resolved));
+        out +=
+            &format!("earlier   a delivery whose outcome was open is decided now: {}\n", one_line(resolved));
     }
     match &report.result {
         Ending::WouldApply { .. } => {
-            println!("dry run   nothing was written; the table would be staged, verified and committed");
+            out += "dry run   nothing was written; the table would be staged, verified and committed\n";
         }
         Ending::Delivered(outcome @ (Outcome::Applied(_) | Outcome::AlreadyActive(_))) => {
-            println!("done      {}", one_line(outcome));
+            out += &format!("done      {}\n", one_line(outcome));
         }
         Ending::Delivered(Outcome::Rejected { reasons }) => {
-            eprintln!("refused: the machine's table was not changed");
-            reasons.iter().for_each(|reason| eprintln!("  {reason}"));
+            err += "refused: the machine's table was not changed\n";
+            reasons.iter().for_each(|reason| err += &format!("  {reason}\n"));
         }
         Ending::Delivered(Outcome::NotApplied { why }) => {
-            eprintln!("failed: {why}");
-            eprintln!("  the machine's table was not changed by this");
+            err += &format!("failed: {why}\n  the machine's table was not changed by this\n");
         }
         Ending::Delivered(Outcome::Unknown { why }) => {
-            eprintln!("unknown: {why}");
-            eprintln!(
-                "  look at the machine before bending; push again when it answers: its table is read first"
+            err += &format!(
+                "unknown: {why}\n  look at the machine before bending; push again when it answers: its table is \
+                 read first\n"
             );
         }
     }
     match (report.record, &report.journal) {
-        (Some(record), Some(journal)) => println!("journal   record {record} in {journal}"),
-        (None, Some(journal)) => eprintln!("warning: the outcome could not be written to journal {journal}"),
+        (Some(record), Some(journal)) => out += &format!("journal   record {record} in {journal}\n"),
+        (None, Some(journal)) => {
+            err += &format!("warning: the outcome could not be written to journal {journal}\n");
+        }
         (_, None) => {}
     }
+    (out, err)
 }
 
 fn one_line(outcome: &Outcome) -> String {

@@ -1,17 +1,108 @@
 //! `benderd simulate`: the simulators on their own.
 
-use super::{Outcome, simulate_bender};
+use std::path::PathBuf;
 
-/// What is simulated.
-#[derive(Debug, clap::Subcommand)]
-pub enum Simulate {
-    /// A bender with a real Modbus TCP server.
+use anyhow::bail;
+use clap::Subcommand;
+
+use super::{Outcome, simulate_bender};
+use crate::cloud::write_scan;
+use crate::config::{Materials, load_part};
+use crate::sim::scan::{Density, PointKind, ScanSettings, TubeShape, scan};
+
+/// Arguments of `benderd simulate`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    simulator: Simulator,
+}
+
+#[derive(Debug, Subcommand)]
+enum Simulator {
+    /// Scans a part as if it had been bent perfectly, with a simulated laser line.
+    Scan(ScanArgs),
+    /// A bender with a real Modbus TCP server, until Ctrl-C.
     Bender(simulate_bender::Args),
 }
 
+#[derive(Debug, clap::Args)]
+struct ScanArgs {
+    /// The part file.
+    #[arg(long)]
+    part: PathBuf,
+    /// Same seed, same scan.
+    #[arg(long)]
+    seed: u64,
+    /// The scan file to write: .ply, or text as .xyz, .asc or .txt.
+    #[arg(long)]
+    out: PathBuf,
+    /// About this many points on the tube.
+    #[arg(long, default_value_t = 50_000, value_parser = clap::value_parser!(u32).range(100..=20_000_000))]
+    points: u32,
+    /// Passes from different sides.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=20))]
+    views: u8,
+    /// Noise along the ray at normal incidence (one sigma).
+    #[arg(long, default_value_t = 0.03, value_parser = at_most::<10>)]
+    noise_mm: f64,
+    /// Share of flying points, 0 to 1.
+    #[arg(long, default_value_t = 0.005, value_parser = at_most::<1>)]
+    outliers: f64,
+    /// Patches of the surface without data.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=1000))]
+    patches: u16,
+    /// Puts a table under the tube.
+    #[arg(long)]
+    table: bool,
+    /// Rests the tube on V-blocks.
+    #[arg(long)]
+    v_blocks: bool,
+    /// Ovality of every bend: (largest - smallest) / nominal diameter.
+    #[arg(long, default_value_t = 0.0, value_parser = at_most::<1>)]
+    ovality: f64,
+}
+
+fn at_most<const MOST: u32>(word: &str) -> Result<f64, String> {
+    let value: f64 = word.parse().map_err(|_| "not a number".to_owned())?;
+    if (0.0..=f64::from(MOST)).contains(&value) { Ok(value) } else { Err(format!("allowed is 0 to {MOST}")) }
+}
+
 /// Runs the subcommand.
-pub fn run(what: &Simulate) -> anyhow::Result<Outcome> {
-    match what {
-        Simulate::Bender(args) => simulate_bender::run(args),
+pub fn run(args: &Args) -> anyhow::Result<Outcome> {
+    match &args.simulator {
+        Simulator::Scan(args) => simulate_scan(args),
+        Simulator::Bender(args) => simulate_bender::run(args),
     }
+}
+
+fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
+    let part = load_part(&args.part, &Materials::shipped()?)?;
+    let ovality = vec![args.ovality; part.lra.bends.len()];
+    let shape = TubeShape { lra: part.lra, od_mm: part.od_mm, ovality };
+    let settings = ScanSettings {
+        density: Density::Points(args.points as usize),
+        views: args.views.into(),
+        noise_mm: args.noise_mm,
+        outlier_share: args.outliers,
+        missing_patches: args.patches.into(),
+        table: args.table,
+        v_blocks: args.v_blocks,
+        ..ScanSettings::default()
+    };
+    let got = scan(&shape, &settings, args.seed);
+    if got.points.is_empty() {
+        bail!("{}: a tube without length cannot be scanned", args.part.display());
+    }
+    write_scan(&args.out, &got.cloud())?;
+    println!(
+        "{}: {} points of {} ({} tube, {} surroundings, {} outliers), true tube radius {} mm",
+        args.out.display(),
+        got.points.len(),
+        part.name,
+        got.count(PointKind::Tube),
+        got.count(PointKind::Surroundings),
+        got.count(PointKind::Outlier),
+        shape.od_mm / 2.0
+    );
+    Ok(Outcome::Done)
 }

@@ -66,7 +66,7 @@ pub fn parse_scan(path: &Path, bytes: &[u8], unit: Unit) -> Result<Scan, CloudEr
 
 fn read_bytes(path: &Path) -> Result<Vec<u8>, CloudError> {
     let file = path.display().to_string();
-    let failed = |source| CloudError::Read { file: file.clone(), source };
+    let failed = |reason| CloudError::Read { file: file.clone(), reason };
     let mut handle = File::open(path).map_err(failed)?;
     let size = handle.metadata().map_err(failed)?.len();
     let too_large = |bytes| CloudError::TooLarge { file: file.clone(), bytes, allowed: LARGEST_FILE };

@@ -6,20 +6,20 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum CloudError {
     /// The system could not read it.
-    #[error("{file}: cannot be read: {source}")]
+    #[error("{file}: cannot be read: {reason}")]
     Read {
         /// Path as given.
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// The system could not write it.
-    #[error("{file}: cannot be written: {source}")]
+    #[error("{file}: cannot be written: {reason}")]
     Write {
         /// Path as given.
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
     /// Not a format that is read (or written).
     #[error("{file}: {found}; scans are .ply, or text as .xyz .asc .pts .csv .txt")]

@@ -53,5 +53,5 @@ fn write(path: &Path, body: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>)
         body(&mut out)?;
         out.flush()
     });
-    written.map_err(|source| CloudError::Write { file: path.display().to_string(), source })
+    written.map_err(|reason| CloudError::Write { file: path.display().to_string(), reason })
 }

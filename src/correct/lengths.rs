@@ -34,6 +34,8 @@ pub struct Lengths {
     belief: Belief,
     wanted: Lra,
     surprise_sigma_mm: Vec<f64>,
+    /// By how much each straight was off beyond doubt in the last part, 0 where it was not.
+    slipped_mm: Vec<f64>,
 }
 
 /// What the bends at the sides of a straight add to it: tangent lengths of the die radius, and these times s/A.
@@ -57,7 +59,12 @@ impl Lengths {
             let variance = point.sigma_mm.powi(2) + RESIDUAL_SIGMA_MM.powi(2);
             belief.update(&[row], &[point.growth_mm], &DMatrix::from_element(1, 1, variance));
         }
-        Lengths { belief, wanted: wanted.clone(), surprise_sigma_mm: vec![0.0; wanted.bends.len()] }
+        Lengths {
+            belief,
+            wanted: wanted.clone(),
+            surprise_sigma_mm: vec![0.0; wanted.bends.len()],
+            slipped_mm: vec![0.0; wanted.bends.len()],
+        }
     }
 
     /// Takes in one part.
@@ -68,11 +75,18 @@ impl Lengths {
             let mut variance = found.sigma_mm.powi(2);
             let expected = self.belief.predict(&row);
             let sigma = expected.sigma.hypot(found.sigma_mm);
-            let off = (found.growth_mm - expected.value).abs() / sigma;
-            if off > DOUBT {
-                variance += sigma.powi(2) * ((off / DOUBT).powi(2) - 1.0);
-            }
+            let off_mm = found.growth_mm - expected.value;
+            let before_mm = std::mem::take(&mut self.slipped_mm[found.straight]);
             self.surprise_sigma_mm[found.straight] = sigma;
+            if off_mm.abs() > DOUBT * sigma {
+                if before_mm * off_mm > 0.0 {
+                    // Twice in a row the same way: the feed has changed.
+                    self.belief.loosen(2 + found.straight, off_mm);
+                } else {
+                    variance += (off_mm / DOUBT).powi(2) - sigma.powi(2);
+                    self.slipped_mm[found.straight] = off_mm;
+                }
+            }
             self.belief.update(&[row], &[found.growth_mm], &DMatrix::from_element(1, 1, variance));
         }
     }
@@ -95,6 +109,11 @@ impl Lengths {
     /// Sigma of a straight's innovation when the last part came in.
     pub fn surprise_sigma_mm(&self, straight: usize) -> f64 {
         self.surprise_sigma_mm[straight]
+    }
+
+    /// Straights (from 0) that the last part's feed missed by more than scatter explains, and by how much.
+    pub fn slips(&self) -> impl Iterator<Item = (usize, f64)> {
+        self.slipped_mm.iter().copied().enumerate().filter(|(_, mm)| *mm != 0.0)
     }
 
     fn row(&self, straight: usize, sides: &Sides) -> DVector<f64> {

@@ -23,23 +23,24 @@ pub use verdict::{Answer, Code, Reason, Verdict};
 
 use crate::inspect::{self, Inspection};
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
-use replay::{Newest, Replay, Used, replay};
+use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
 
 /// One step of the loop: what the history says, and the table to bend with next.
 pub fn step(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
     let rows = Rows::of(nominal);
     let (bent, merged) = (rows.merged(nominal), rows.merge(history));
-    rows.expand(step_of_bends(&bent, &merged, knowledge, limits))
+    rows.expand(step_of_bends(&Job { nominal: &bent, history: &merged, knowledge, limits }))
 }
 
 /// What was known with what this job showed put in; a job replaces its own earlier record.
-pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge) -> Knowledge {
+pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Knowledge {
     let rows = Rows::of(nominal);
     let (nominal, history) = (rows.merged(nominal), rows.merge(history));
     let mut out = knowledge.clone();
     if same_scan(&history).is_none() {
-        let replay = replay(&nominal, &history, knowledge, false);
+        let job = Job { nominal: &nominal, history: &history, knowledge, limits };
+        let replay = replay(&job, false);
         if let Some(record) = knowledge::record(&nominal, &history, &replay.used) {
             out.put(&knowledge::Key::of(&nominal, &history.key), record);
         }
@@ -48,78 +49,66 @@ pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge) -> Kno
 }
 
 /// For tables without rows of angle 0.
-fn step_of_bends(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
-    let replay = replay(nominal, history, knowledge, false);
-    let decided = decide(nominal, history, &replay, limits);
-    let Newest::Used { ambiguous: true, .. } = replay.newest else { return decided };
-    let other = self::replay(nominal, history, knowledge, true);
-    let turned = decide(nominal, history, &other, limits);
-    if matters(&decided, &turned, nominal) {
+fn step_of_bends(job: &Job) -> Answer {
+    let read = replay(job, false);
+    let decided = decide(job, &read);
+    let Newest::Used { ambiguous: true, .. } = read.newest else { return decided };
+    let turned = decide(job, &replay(job, true));
+    if matters(&decided, &turned, job.nominal) {
         let text = "the scan fits the part from both ends, and the next table depends on which it was: mark the \
                     first end and scan again";
-        return held(nominal, history, &replay, vec![Reason::new(Code::Direction, text)]);
+        return held(job, &read, vec![Reason::new(Code::Direction, text)]);
     }
     decided
 }
 
-fn decide(nominal: &Nominal, history: &History, replay: &Replay, limits: &Limits) -> Answer {
-    if let Some(reason) = same_scan(history) {
-        return held(nominal, history, replay, vec![reason]);
+fn decide(job: &Job, replay: &Replay) -> Answer {
+    if let Some(reason) = same_scan(job.history) {
+        return held(job, replay, vec![reason]);
     }
-    match &replay.newest {
-        Newest::None => first_piece(nominal, history, replay, limits),
-        Newest::Refused(reason) => held(nominal, history, replay, vec![reason.clone()]),
-        Newest::Used { outliers, .. } => {
-            let Some(newest) = replay.used.last() else {
-                return first_piece(nominal, history, replay, limits);
-            };
-            let doubts = doubts(nominal, newest, outliers);
-            if !doubts.is_empty() {
-                return answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts);
+    match (&replay.newest, replay.used.last()) {
+        (Newest::Refused(reason), _) => held(job, replay, vec![reason.clone()]),
+        (Newest::Used { outliers, .. }, Some(newest)) => {
+            let doubts = doubts(job.nominal, newest, outliers);
+            if doubts.is_empty() {
+                judged(job, replay, newest)
+            } else {
+                answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts)
             }
-            judged(nominal, history, replay, newest, limits)
         }
+        (Newest::None, _) | (Newest::Used { .. }, None) => first_piece(job, replay),
     }
 }
 
-fn first_piece(nominal: &Nominal, history: &History, replay: &Replay, limits: &Limits) -> Answer {
-    let mut table = plan::first(&replay.model, nominal);
-    plan::clamp(&mut table, limits);
-    let violations = plan::violations(&table, nominal, limits);
+fn first_piece(job: &Job, replay: &Replay) -> Answer {
+    let mut table = plan::first(&replay.model, job.nominal);
+    plan::clamp(&mut table, job.limits);
+    let violations = plan::violations(&table, job.nominal, job.limits);
     if !violations.is_empty() {
-        return held(nominal, history, replay, violations);
+        return held(job, replay, violations);
     }
     answer(Verdict::FirstPiece, table, replay, Vec::new())
 }
 
-/// The newest part is a fair measurement of this part: good, to correct, or past correcting.
-fn judged(nominal: &Nominal, history: &History, replay: &Replay, newest: &Used, limits: &Limits) -> Answer {
+/// The newest part is a fair measurement of what its table bends: good, to correct, or past correcting.
+fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
+    let nominal = job.nominal;
     let in_force = newest.commanded.clone();
     let seen = |measured: &MeasuredTube| inspect::inspect(measured, nominal);
     let (whole, inspection) = match (seen(&newest.measured), seen(&trimmed(&newest.measured, nominal))) {
         (Ok(whole), Ok(trimmed)) => (whole, trimmed),
         (Err(e), _) | (_, Err(e)) => {
-            return held(nominal, history, replay, vec![Reason::new(Code::Unusable, e.to_string())]);
+            return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]);
         }
     };
-    let cut = cut_length(&whole, nominal, history);
-    let mut reasons: Vec<Reason> = cut.into_iter().collect();
-    match inspection.verdict {
-        inspect::Verdict::WrongHand => {
-            return held(nominal, history, replay, vec![Reason::new(Code::WrongHand, inspection.advice)]);
-        }
-        inspect::Verdict::WrongPart => {
-            return held(nominal, history, replay, vec![Reason::new(Code::WrongPart, inspection.advice)]);
-        }
-        inspect::Verdict::InTolerance => {
-            return answer(Verdict::InTolerance, in_force, replay, reasons);
-        }
-        inspect::Verdict::OutOfTolerance | inspect::Verdict::Uncertain => {}
+    let mut reasons: Vec<Reason> = cut_length(&whole, job).into_iter().collect();
+    if inspection.verdict == inspect::Verdict::InTolerance {
+        return answer(Verdict::InTolerance, in_force, replay, reasons);
     }
-    let (table, changes) = plan::next(&replay.model, nominal, newest, limits);
-    let violations = plan::violations(&table, nominal, limits);
+    let (table, changes) = plan::next(&replay.model, nominal, newest, job.limits);
+    let violations = plan::violations(&table, nominal, job.limits);
     if !violations.is_empty() {
-        return held(nominal, history, replay, violations);
+        return held(job, replay, violations);
     }
     reasons.extend(changes);
     if table != in_force {
@@ -129,7 +118,7 @@ fn judged(nominal: &Nominal, history: &History, replay: &Replay, newest: &Used, 
         reasons.push(Reason::new(Code::Unseen, inspection.advice));
         return answer(Verdict::Rescan, in_force, replay, reasons);
     }
-    let text = format!("{} (the table stays: by all parts so far this is scatter)", inspection.advice);
+    let text = format!("{}, but no row by more than its dead band: the table stays", inspection.advice);
     reasons.push(Reason::new(Code::Scatter, text));
     answer(Verdict::Correct, in_force, replay, reasons)
 }
@@ -180,14 +169,14 @@ fn trimmed(measured: &MeasuredTube, nominal: &Nominal) -> MeasuredTube {
     out
 }
 
-fn cut_length(whole: &Inspection, nominal: &Nominal, history: &History) -> Option<Reason> {
+fn cut_length(whole: &Inspection, job: &Job) -> Option<Reason> {
     let last = whole.last_length_mm?;
     let off = last.deviation?;
-    if off.abs() <= nominal.tolerance.length_mm {
+    if off.abs() <= job.nominal.tolerance.length_mm {
         return None;
     }
     let how = if off < 0.0 { "longer" } else { "shorter" };
-    let cut = history.parts.last().and_then(|p| p.cut_length_mm);
+    let cut = job.history.parts.last().and_then(|p| p.cut_length_mm);
     let figure = cut.map_or(String::new(), |c| format!(" ({:.1} mm)", c - off));
     let text = format!(
         "the last straight is {:.2} mm instead of {:.2}: cut the tube {:.2} mm {how}{figure}, no feed corrects that",
@@ -224,9 +213,9 @@ fn matters(a: &Answer, b: &Answer, nominal: &Nominal) -> bool {
     stops(a) != stops(b) || both.into_iter().any(differs)
 }
 
-fn held(nominal: &Nominal, history: &History, replay: &Replay, reasons: Vec<Reason>) -> Answer {
-    let in_force = history.parts.last().map(|p| p.commanded.clone());
-    let table = in_force.unwrap_or_else(|| CommandTable::from_lra(&nominal.lra));
+fn held(job: &Job, replay: &Replay, reasons: Vec<Reason>) -> Answer {
+    let in_force = job.history.parts.last().map(|p| p.commanded.clone());
+    let table = in_force.unwrap_or_else(|| CommandTable::from_lra(&job.nominal.lra));
     answer(Verdict::Hold, table, replay, reasons)
 }
 

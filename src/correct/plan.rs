@@ -50,11 +50,19 @@ struct Change {
 }
 
 impl Change {
-    /// The new value, and whether the step limit cut it; None within the dead band.
-    fn apply(&self) -> Option<(f64, bool)> {
+    /// The new value; None within the dead band.
+    fn apply(&self) -> Option<f64> {
         let change = self.wanted - self.current;
-        (change.abs() > self.dead_band)
-            .then(|| (self.current + change.clamp(-self.step, self.step), change.abs() > self.step))
+        (change.abs() > self.dead_band).then(|| self.current + change.clamp(-self.step, self.step))
+    }
+
+    /// Said when the step limit cut the change; `unit` and its size in the value's own.
+    fn cut(&self, i: usize, what: &str, unit: &str, size: f64) -> Option<Reason> {
+        let change = self.wanted - self.current;
+        let text = || {
+            format!("{what} {}: change of {:+.2} cut to {:.2} {unit}", i + 1, change / size, self.step / size)
+        };
+        (change.abs() > self.step).then(|| Reason::at(Code::StepLimit, i, text()))
     }
 }
 
@@ -79,6 +87,13 @@ pub fn next(model: &Model, nominal: &Nominal, newest: &Used, limits: &Limits) ->
     (0..nominal.lra.bends.len()).for_each(|i| plan.angle(i));
     (0..nominal.lra.bends.len()).for_each(|i| plan.rotation(i));
     plan.lengths();
+    for (i, off_mm) in model.lengths.slips() {
+        let text = format!(
+            "feed {}: {off_mm:+.2} mm off what was expected: mostly slip of a worn clamp; not chased unless it stays",
+            i + 1
+        );
+        plan.reasons.push(Reason::at(Code::Slip, i, text));
+    }
     (plan.table, plan.reasons)
 }
 
@@ -101,7 +116,7 @@ impl Plan<'_> {
             dead_band: dead_band(self.nominal.tolerance.angle_rad, measured.angle_sigma_rad),
             step: self.limits.step_angle_rad.max(3.0 * self.model.springback.surprise_sigma_rad(i)),
         };
-        let Some((value, cut)) = change.apply() else { return };
+        let Some(value) = change.apply() else { return };
         self.table.bends[i].angle_rad = value;
         let deg = f64::to_degrees;
         let text = format!(
@@ -113,7 +128,7 @@ impl Plan<'_> {
             deg(change.current)
         );
         self.reasons.push(Reason::at(Code::Angle, i, text));
-        self.cut(cut, i, "angle", deg(change.wanted - change.current), deg(change.step), "degrees");
+        self.reasons.extend(change.cut(i, "angle", "degrees", DEGREE));
     }
 
     fn rotation(&mut self, i: usize) {
@@ -129,7 +144,7 @@ impl Plan<'_> {
             dead_band: dead_band(tolerance, found.sigma),
             step: self.limits.step_rotation_rad,
         };
-        let Some((value, cut)) = change.apply() else { return };
+        let Some(value) = change.apply() else { return };
         self.table.bends[i].rotation_rad = value;
         let deg = f64::to_degrees;
         let text = format!(
@@ -141,7 +156,7 @@ impl Plan<'_> {
             deg(current)
         );
         self.reasons.push(Reason::at(Code::Rotation, i, text));
-        self.cut(cut, i, "rotation", deg(change.wanted - current), deg(change.step), "degrees");
+        self.reasons.extend(change.cut(i, "rotation", "degrees", DEGREE));
     }
 
     fn lengths(&mut self) {
@@ -155,7 +170,7 @@ impl Plan<'_> {
                 dead_band: dead_band(self.nominal.tolerance.length_mm, found.map_or(0.0, |f| f.sigma)),
                 step: self.limits.step_length_mm.max(3.0 * self.model.lengths.surprise_sigma_mm(i)),
             };
-            let Some((value, cut)) = change.apply() else { continue };
+            let Some(value) = change.apply() else { continue };
             let shortest = shortest_feed(&self.limits.machine, i);
             let held = value.max(shortest);
             if value < shortest {
@@ -168,14 +183,7 @@ impl Plan<'_> {
             self.table.bends[i].length_mm = held;
             let text = format!("feed {}: {held:.2} mm, was {:.2}", i + 1, change.current);
             self.reasons.push(Reason::at(Code::Length, i, text));
-            self.cut(cut, i, "feed", change.wanted - change.current, change.step, "mm");
-        }
-    }
-
-    fn cut(&mut self, cut: bool, i: usize, what: &str, wanted: f64, step: f64, unit: &str) {
-        if cut {
-            let text = format!("{what} {}: change of {wanted:+.2} cut to {step:.2} {unit}", i + 1);
-            self.reasons.push(Reason::at(Code::StepLimit, i, text));
+            self.reasons.extend(change.cut(i, "feed", "mm", 1.0));
         }
     }
 }

@@ -5,6 +5,7 @@ use super::estimate::{Outlier, Springback};
 use super::history::{History, Part};
 use super::knowledge::{Key, Knowledge};
 use super::lengths::{Lengths, Rotations};
+use super::plan::{self, Limits};
 use super::verdict::{Code, Reason};
 use crate::inspect::{self, Known};
 use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
@@ -60,8 +61,22 @@ pub enum Newest {
     Refused(Reason),
 }
 
+/// All that a step is given.
+#[derive(Debug, Clone, Copy)]
+pub struct Job<'a> {
+    /// The part, without rows of angle 0.
+    pub nominal: &'a Nominal,
+    /// What was bent and measured.
+    pub history: &'a History,
+    /// What is known of the key.
+    pub knowledge: &'a Knowledge,
+    /// What a correction may do.
+    pub limits: &'a Limits,
+}
+
 /// Works the history through. `turn_newest` reads the newest part against the better direction.
-pub fn replay(nominal: &Nominal, history: &History, knowledge: &Knowledge, turn_newest: bool) -> Replay {
+pub fn replay(job: &Job, turn_newest: bool) -> Replay {
+    let Job { nominal, history, knowledge, .. } = *job;
     let key = Key::of(nominal, &history.key);
     let records = knowledge.of_others(&key, history.job_id(nominal).as_deref());
     let model = Model {
@@ -72,7 +87,7 @@ pub fn replay(nominal: &Nominal, history: &History, knowledge: &Knowledge, turn_
     let mut out = Replay { model, used: Vec::new(), newest: Newest::None, left_out: Vec::new() };
     for (i, part) in history.parts.iter().enumerate() {
         let newest = i + 1 == history.parts.len();
-        match oriented(nominal, part, &out.model, newest && turn_newest) {
+        match oriented(job, part, &out.model, newest && turn_newest) {
             Ok((measured, ambiguous)) => {
                 let outliers = out.model.learn(nominal, &part.commanded, &measured);
                 let rejected = outliers.iter().map(|o| o.bend).collect();
@@ -121,12 +136,8 @@ impl Model {
 }
 
 /// The part's measurement in the nominal's direction, and whether the other fits nearly as well.
-fn oriented(
-    nominal: &Nominal,
-    part: &Part,
-    model: &Model,
-    turn: bool,
-) -> Result<(MeasuredTube, bool), Reason> {
+fn oriented(job: &Job, part: &Part, model: &Model, turn: bool) -> Result<(MeasuredTube, bool), Reason> {
+    let Job { nominal, limits, .. } = *job;
     let wanted = nominal.lra.bends.len();
     let unusable = |text: String| Reason::new(Code::Unusable, text);
     inspect::check(&part.measured).map_err(|e| unusable(e.to_string()))?;
@@ -134,6 +145,10 @@ fn oriented(
     if part.commanded.bends.len() != wanted {
         let text = format!("the commanded table has {} bends, the part {wanted}", part.commanded.bends.len());
         return Err(Reason::new(Code::Program, text + ": which program ran?"));
+    }
+    if let Some(off) = plan::violations(&part.commanded, nominal, limits).first() {
+        let text = format!("the commanded table is not this part's: {}", off.text);
+        return Err(Reason::new(Code::Program, text));
     }
     let settled = part.measured.reversed.is_some();
     if part.measured.bends.len() != wanted {
@@ -145,6 +160,11 @@ fn oriented(
     if reading.wrong_hand {
         let text = "the mirror image of the part fits better: check program and loading";
         return Err(Reason::new(Code::WrongHand, text));
+    }
+    if !reading.misfit.far.is_empty() {
+        let text =
+            format!("not what this table bends: {}; which part was scanned?", reading.misfit.far.join(", "));
+        return Err(Reason::new(Code::WrongPart, text));
     }
     let mut measured =
         if reading.reversed != turn { part.measured.reversed() } else { part.measured.clone() };

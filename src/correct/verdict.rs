@@ -62,6 +62,8 @@ pub enum Code {
     CutLength,
     /// Out of tolerance by scatter: nothing that a table could take out.
     Scatter,
+    /// A feed came out unlike before: slip is not chased until it stays.
+    Slip,
     /// An earlier part of the history was not used.
     LeftOut,
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 use serde::Serialize;
 
-use super::laid::{Layout, points_of};
+use super::laid::{Known, Layout, points_of};
 use crate::tube::align::{Pair, register};
 use crate::tube::{Alignment, Lra};
 
@@ -161,19 +161,19 @@ fn direction(nominal: &Lra, straight: usize) -> Vector3<f64> {
 /// The layout with one value after the other moved by its sigma.
 fn one_sigma_each(layout: &Layout) -> Vec<Layout> {
     let mut out = Vec::new();
-    let mut push = |change: &dyn Fn(&mut Layout) -> Option<()>| {
+    let mut push = |pick: &dyn Fn(&mut Layout) -> Option<&mut Known>| {
         let mut moved = layout.clone();
-        if change(&mut moved).is_some() {
+        if let Some(known) = pick(&mut moved) {
+            known.value += known.sigma;
             out.push(moved);
         }
     };
-    let step = |known: &mut super::laid::Known| known.value += known.sigma;
     for i in 0..layout.angle.len() {
-        push(&|l| Some(step(&mut l.angle[i])));
-        push(&|l| l.rotation[i].as_mut().map(step));
+        push(&|l| Some(&mut l.angle[i]));
+        push(&|l| l.rotation[i].as_mut());
     }
     for j in 0..layout.distance.len() {
-        push(&|l| l.distance[j].as_mut().map(step));
+        push(&|l| l.distance[j].as_mut());
     }
     out
 }

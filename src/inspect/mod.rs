@@ -5,8 +5,8 @@
 //!
 //! - every check point (start, middle, end of each straight, so the tube's ends too) within the envelope after
 //!   the part's named alignment, and every bend angle within its tolerance, both with a guard band of 2 sigma;
-//! - a length or rotation counts only where the scan can see it (2 sigma below its tolerance); elsewhere it is
-//!   listed and the check points speak for it;
+//! - a length or rotation (they scatter on shallow bends and short straights though the shape is right) refuses a
+//!   tube only when it is out for certain; where the scan doubts it, the check points speak for it;
 //! - what the scan does not know (null) is left out and said; a tube with unseen check points is not accepted.
 
 mod deviation;
@@ -268,7 +268,7 @@ fn points(out: &mut Inspection, layout: &Layout, wanted: &Lra, nominal: &Nominal
 fn verdict(inspection: &Inspection, bends: usize) -> Verdict {
     let points = inspection.points.iter().map(|p| p.state);
     let angles = inspection.bends.iter().filter_map(|b| b.angle_deg.state);
-    let others = counted(inspection).filter_map(|(_, c)| c.state);
+    let others = lengths_and_turns(inspection).filter_map(|(_, c)| c.state).filter(|s| *s == State::Out);
     let states: Vec<State> = points.chain(angles).chain(others).collect();
     let all_points = inspection.points.len() == 3 * (bends + 1);
     if states.contains(&State::Out) {
@@ -280,8 +280,8 @@ fn verdict(inspection: &Inspection, bends: usize) -> Verdict {
     }
 }
 
-/// Lengths and rotations that the scan can see: 2 sigma within the tolerance. With their names.
-fn counted(inspection: &Inspection) -> impl Iterator<Item = (String, &Comparison)> {
+/// Lengths and rotations with their names.
+fn lengths_and_turns(inspection: &Inspection) -> impl Iterator<Item = (String, &Comparison)> {
     let tail = inspection.bends.len() + 1;
     let rows = inspection.bends.iter().flat_map(|b| {
         [
@@ -290,7 +290,7 @@ fn counted(inspection: &Inspection) -> impl Iterator<Item = (String, &Comparison
         ]
     });
     let last = inspection.last_length_mm.iter().map(move |c| (format!("length of straight {tail}"), c));
-    rows.chain(last).filter(|(_, c)| c.sigma.zip(c.tolerance).is_some_and(|(s, t)| 2.0 * s <= t))
+    rows.chain(last)
 }
 
 /// What is off by most of its tolerance among those in the wanted state, in words.
@@ -306,7 +306,8 @@ fn worst(inspection: &Inspection, state: State) -> Option<String> {
         found.push((p.deviation_mm / inspection.envelope_mm, text));
     }
     let angles = inspection.bends.iter().map(|b| (format!("angle of bend {}", b.bend), &b.angle_deg));
-    for (name, c) in angles.chain(counted(inspection)).filter(|(_, c)| c.state == Some(state)) {
+    let others = lengths_and_turns(inspection).filter(|_| state == State::Out);
+    for (name, c) in angles.chain(others).filter(|(_, c)| c.state == Some(state)) {
         if let (Some(deviation), Some(tolerance)) = (c.deviation, c.tolerance) {
             let text = format!("{name} is off by {deviation:+.2} (tolerance {tolerance})");
             found.push((deviation.abs() / tolerance, text));

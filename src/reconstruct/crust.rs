@@ -132,9 +132,10 @@ fn gap_cost(points: &[SpinePoint], a: (&[usize], bool), b: (&[usize], bool), rad
     let across = gap / distance.max(1e-12);
     let cosine = |out: Option<Vector3<f64>>, across: Vector3<f64>| out.map_or(1.0, |out| out.dot(&across));
     let (one, other) = (cosine(out_a, across), cosine(out_b, -across));
-    // Close by, the neighbourhood's noise decides the direction: any forward one will do.
-    let least = if distance < 1.5 * radius_mm { 0.0 } else { 0.5 };
-    (one >= least && other >= least).then_some(distance * (3.0 - one - other))
+    // A bend may be hidden in the gap: 0.8 lets both ends look past each other by 66 degrees. Close by, the
+    // neighbourhood's noise decides the direction: any forward one will do.
+    let least = if distance < 1.5 * radius_mm { 0.0 } else { 0.8 };
+    (one >= 0.0 && other >= 0.0 && one + other >= least).then_some(distance * (3.0 - one - other))
 }
 
 /// Position of an end and the direction in which the piece would go on (none for a single point).

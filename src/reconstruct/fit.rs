@@ -128,16 +128,21 @@ fn descend(
     effort: &Effort,
 ) -> Descent {
     let noise = cutoff / CUTOFF_SIGMAS;
-    let total =
-        |model: &TubeModel, pass: &Pass| pass.cost + effort.prior.map_or(0.0, |p| p.cost(model, noise));
+    let total = |model: &TubeModel, pass: &Pass| {
+        let off =
+            expectations(model, parameters, &effort.prior).map(|(_, off, spread)| (off / spread).powi(2));
+        pass.cost + 0.5 * noise * noise * off.sum::<f64>()
+    };
     let mut model = start;
     let mut pass = sample.pass(&model, cutoff);
     let mut cost = total(&model, &pass);
     let (mut passes, mut damping) = (1, 1e-4);
     for _ in 0..effort.steps {
         let (mut normal, mut gradient) = pass.normal_equations(&model.motions(parameters), parameters);
-        if let Some(prior) = &effort.prior {
-            prior.add_to(&model, parameters, noise, &mut normal, &mut gradient);
+        for (j, off, spread) in expectations(&model, parameters, &effort.prior) {
+            let weight = (noise / spread).powi(2);
+            normal[(j, j)] += weight;
+            gradient[j] += weight * off;
         }
         freeze_at_bounds(&model, parameters, &mut normal, &mut gradient);
         let mut improved = false;
@@ -173,28 +178,23 @@ fn descend(
     Descent { model, pass, passes, stop: Stop::Iterations }
 }
 
-impl RadiusPrior {
-    fn cost(&self, model: &TubeModel, noise_mm: f64) -> f64 {
-        let off = |radius: f64| (radius - self.radius_mm) / self.spread_mm * noise_mm;
-        model.lra.bends.iter().map(|b| 0.5 * off(b.radius_mm).powi(2)).sum()
-    }
+/// Sections of bends are expected to be this oval at most, in tube radii.
+const OVALITY_SPREAD: f64 = 0.03;
 
-    fn add_to(
-        &self,
-        model: &TubeModel,
-        parameters: &[Parameter],
-        noise_mm: f64,
-        normal: &mut DMatrix<f64>,
-        gradient: &mut DVector<f64>,
-    ) {
-        let weight = (noise_mm / self.spread_mm).powi(2);
-        for (j, parameter) in parameters.iter().enumerate() {
-            if let Parameter::BendRadius(i) = *parameter {
-                normal[(j, j)] += weight;
-                gradient[j] += weight * (model.lra.bends[i].radius_mm - self.radius_mm);
-            }
+/// What is expected of values that the data may not carry: value, expectation, spread. Weak, and not in the
+/// covariance.
+fn expectations<'a>(
+    model: &'a TubeModel,
+    parameters: &'a [Parameter],
+    prior: &'a Option<RadiusPrior>,
+) -> impl Iterator<Item = (usize, f64, f64)> + 'a {
+    parameters.iter().enumerate().filter_map(move |(j, parameter)| match *parameter {
+        Parameter::Ovality(i) => Some((j, model.ovality_mm[i], OVALITY_SPREAD * model.tube_radius_mm)),
+        Parameter::BendRadius(i) => {
+            prior.map(|p| (j, model.lra.bends[i].radius_mm - p.radius_mm, p.spread_mm))
         }
-    }
+        _ => None,
+    })
 }
 
 /// Takes parameters that stand at a bound and would cross it out of the step.
@@ -239,7 +239,7 @@ fn unit_diagonal(matrix: &DMatrix<f64>) -> (DMatrix<f64>, DVector<f64>) {
 }
 
 /// Inverse of a normal matrix; directions that the data does not see get a huge, finite variance.
-fn invert(matrix: &DMatrix<f64>) -> DMatrix<f64> {
+pub fn invert(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     let (mut scaled, scale) = unit_diagonal(matrix);
     let n = scale.len();
     for exponent in -15..0 {

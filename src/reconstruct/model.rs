@@ -17,6 +17,9 @@ pub struct TubeModel {
     pub lra: Lra,
     /// Outer radius of the tube.
     pub tube_radius_mm: f64,
+    /// How oval each bend's section is: its radius is the tube's plus this times cos 2 psi, psi from the outside of the
+    /// bend; negative where the bend is flattened, as is usual.
+    pub ovality_mm: Vec<f64>,
     /// One radius for all bends (one die) instead of one each.
     pub common_radius: bool,
 }
@@ -36,6 +39,8 @@ pub enum Parameter {
     BendRadius(usize),
     /// CLR of all bends.
     CommonRadius,
+    /// Ovality of bend i.
+    Ovality(usize),
     /// Outer radius of the tube.
     TubeRadius,
 }
@@ -47,9 +52,20 @@ pub struct SegmentMotion {
     pub twists: Matrix6xX<f64>,
     /// Parameter of the segment's own CLR, for arcs.
     pub own_radius: Option<usize>,
+    /// Parameter of the segment's own ovality, for arcs.
+    pub own_ovality: Option<usize>,
 }
 
+/// Ovality beyond this share of the radius is no bent tube's any more.
+const MOST_OVAL: f64 = 0.15;
+
 impl TubeModel {
+    /// A tube of round section with a radius for every bend.
+    pub fn round(start: Frame, lra: Lra, tube_radius_mm: f64) -> TubeModel {
+        let ovality_mm = vec![0.0; lra.bends.len()];
+        TubeModel { start, lra, tube_radius_mm, ovality_mm, common_radius: false }
+    }
+
     /// The free values in their order.
     pub fn parameters(&self) -> Vec<Parameter> {
         let n = self.lra.bends.len();
@@ -64,6 +80,7 @@ impl TubeModel {
             if !self.common_radius {
                 all.push(Parameter::BendRadius(i));
             }
+            all.push(Parameter::Ovality(i));
         }
         if self.common_radius && n > 0 {
             all.push(Parameter::CommonRadius);
@@ -97,7 +114,9 @@ impl TubeModel {
                     Parameter::CommonRadius => k % 2 == 1,
                     _ => false,
                 };
-                SegmentMotion { twists, own_radius: parameters.iter().position(own) }
+                let own_ovality =
+                    parameters.iter().position(|p| matches!(p, Parameter::Ovality(i) if k == 2 * i + 1));
+                SegmentMotion { twists, own_radius: parameters.iter().position(own), own_ovality }
             })
             .collect()
     }
@@ -107,6 +126,8 @@ impl TubeModel {
     pub fn stepped(&self, parameters: &[Parameter], step: &DVector<f64>) -> TubeModel {
         let mut out = self.moved(parameters, step);
         out.tube_radius_mm = out.tube_radius_mm.clamp(0.5 * self.tube_radius_mm, 2.0 * self.tube_radius_mm);
+        let most_oval = MOST_OVAL * out.tube_radius_mm;
+        out.ovality_mm.iter_mut().for_each(|e| *e = e.clamp(-most_oval, most_oval));
         for b in &mut out.lra.bends {
             b.length_mm = b.length_mm.max(0.0);
             b.rotation_rad = wrap_angle(b.rotation_rad);
@@ -128,6 +149,7 @@ impl TubeModel {
                 Parameter::Angle(i) => out.lra.bends[i].angle_rad += d,
                 Parameter::BendRadius(i) => out.lra.bends[i].radius_mm += d,
                 Parameter::CommonRadius => out.lra.bends.iter_mut().for_each(|b| b.radius_mm += d),
+                Parameter::Ovality(i) => out.ovality_mm[i] += d,
                 Parameter::TubeRadius => out.tube_radius_mm += d,
             }
         }
@@ -164,7 +186,7 @@ fn sources(parameter: &Parameter, spine: &Spine) -> Vec<(usize, Vector6<f64>)> {
         }
         Parameter::BendRadius(i) => vec![end_shift(spine, i)],
         Parameter::CommonRadius => (0..segments.len() / 2).map(|i| end_shift(spine, i)).collect(),
-        Parameter::TubeRadius => Vec::new(),
+        Parameter::Ovality(_) | Parameter::TubeRadius => Vec::new(),
     }
 }
 
@@ -184,7 +206,7 @@ fn join(velocity: Vector3<f64>, angular: Vector3<f64>) -> Vector6<f64> {
 }
 
 /// The same twist seen from `frame`.
-fn in_frame(twist: &Vector6<f64>, frame: &Frame) -> Vector6<f64> {
+pub fn in_frame(twist: &Vector6<f64>, frame: &Frame) -> Vector6<f64> {
     let (velocity, angular) = (twist.fixed_rows::<3>(0).into_owned(), twist.fixed_rows::<3>(3).into_owned());
     let at_origin = velocity + angular.cross(&frame.translation.vector);
     join(frame.rotation.inverse() * at_origin, frame.rotation.inverse() * angular)

@@ -2,9 +2,9 @@
 //!
 //! A rigid twist of the tube changes a point's distance by the product of its normal line's Plücker coordinates
 //! (m, p x m) with the twist (paper 004, section 2). So a point's Jacobian row is that six-vector times the
-//! segment's twist matrix, plus two columns of its own: the arc's CLR and the tube's radius. The sum of their
-//! outer products per segment, nine numbers squared, is all of the points that the normal equations need: a pass
-//! costs O(points) whatever the number of bends.
+//! segment's twist matrix, plus three columns of its own: the arc's CLR, its ovality and the tube's radius. The sum of
+//! their outer products per segment, ten numbers squared, is all of the points that the normal equations need: a
+//! pass costs O(points) whatever the number of bends.
 //!
 //! Sums run over chunks of fixed size and are added in order: the result does not depend on the threads.
 
@@ -17,14 +17,27 @@ use crate::tube::SegmentKind;
 /// Points per chunk of a sum.
 const CHUNK: usize = 4096;
 
-/// Rows and columns of a moment: six Plücker coordinates, own CLR, tube radius, residual.
-type Moment = SMatrix<f64, 9, 9>;
+/// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
+pub const ROWS: usize = 9;
+
+/// The derivatives and the residual, squared.
+pub type Moment = SMatrix<f64, 10, 10>;
+
+/// A section turns from round to oval over this many tube radii at both ends of a bend.
+const OVAL_RAMP_RADII: f64 = 1.0;
 
 /// A segment prepared for the pass.
 struct Local {
     to_local: Isometry3<f64>,
     length_mm: f64,
-    arc: Option<(f64, f64)>,
+    arc: Option<Arc>,
+}
+
+/// What makes an arc.
+struct Arc {
+    radius_mm: f64,
+    angle_rad: f64,
+    ovality_mm: f64,
 }
 
 /// What a point sees of its segment, in the segment's frame.
@@ -32,8 +45,7 @@ struct Local {
 struct Sight {
     /// Signed distance from the tube's surface, outside positive.
     residual_mm: f64,
-    /// Derivatives of the residual: Plücker coordinates (negated), own CLR, tube radius.
-    row: [f64; 8],
+    row: [f64; ROWS],
 }
 
 /// The sums of one pass.
@@ -51,6 +63,17 @@ pub struct Pass {
     pub used: usize,
 }
 
+/// The moment of one piece of a segment.
+#[derive(Debug, Clone)]
+pub struct Station {
+    /// The segment.
+    pub segment: usize,
+    /// Arc length at which the piece ends.
+    pub end_mm: f64,
+    /// Squared derivatives and residuals, lower triangle, in the segment's frame.
+    pub moment: Moment,
+}
+
 /// Points with the segment that each belongs to, kept from pass to pass.
 #[derive(Debug, Clone)]
 pub struct Sample {
@@ -65,6 +88,21 @@ impl Sample {
         let spine = model.spine();
         let segment = points.par_iter().map(|p| spine.closest(p).segment as u32).collect();
         Sample { points, segment }
+    }
+
+    /// The same points for another model of nearly the same tube: each looks for its segment from where it was.
+    pub fn follow(&self, from: &TubeModel, to: &TubeModel) -> Sample {
+        let (old, new) = (from.spine(), to.spine());
+        let locals = prepare(to);
+        let follow = |(p, segment): (&Point3<f64>, &u32)| {
+            let segment = &old.segments()[*segment as usize];
+            let at = segment.start_mm + segment.closest_along_mm(p);
+            let mut next = new.segments().partition_point(|s| s.start_mm + s.length_mm < at) as u32;
+            settle(p, &mut next, &locals);
+            next
+        };
+        let segment = self.points.par_iter().zip(&self.segment).map(follow).collect();
+        Sample { points: self.points.clone(), segment }
     }
 
     /// Signed distances of all points from the model's surface; also moves each point to its segment.
@@ -89,22 +127,58 @@ impl Sample {
     /// Sums residuals and their derivatives with the biweight of cut-off `cutoff_mm`.
     pub fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
         let locals = prepare(model);
-        let radius = model.tube_radius_mm;
+        self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, locals.len(), |segment, _| segment)
+    }
+
+    /// The same with every segment cut into stations of about the given length.
+    pub fn pass_by_station(&mut self, model: &TubeModel, cutoff_mm: f64, station_mm: f64) -> Vec<Station> {
+        let spine = model.spine();
+        let counts = spine.segments().iter().map(|s| (s.length_mm / station_mm).ceil().max(1.0) as usize);
+        let counts: Vec<usize> = counts.collect();
+        let first: Vec<usize> = counts
+            .iter()
+            .scan(0, |next, n| {
+                *next += n;
+                Some(*next - n)
+            })
+            .collect();
+        let total = counts.iter().sum();
+        let locals = prepare(model);
+        let pass = self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, total, |k, p| {
+            let share = locals[k].along_mm(p) / locals[k].length_mm.max(1e-12);
+            first[k] + ((share * counts[k] as f64) as usize).min(counts[k] - 1)
+        });
+        let stations = spine.segments().iter().enumerate().flat_map(|(segment, s)| {
+            let n = counts[segment];
+            (0..n).map(move |i| (segment, s.start_mm + s.length_mm * (i + 1) as f64 / n as f64))
+        });
+        let with_moment = stations.zip(pass.moments);
+        with_moment.map(|((segment, end_mm), moment)| Station { segment, end_mm, moment }).collect()
+    }
+
+    fn pass_by(
+        &mut self,
+        locals: &[Local],
+        tube_radius_mm: f64,
+        cutoff_mm: f64,
+        bins: usize,
+        bin: impl Fn(usize, &Point3<f64>) -> usize + Sync,
+    ) -> Pass {
         let chunks: Vec<Pass> = self
             .points
             .par_chunks(CHUNK)
             .zip(self.segment.par_chunks_mut(CHUNK))
             .map(|(points, segments)| {
-                let mut pass = Pass::empty(locals.len());
+                let mut pass = Pass::empty(bins);
                 for (p, segment) in points.iter().zip(segments) {
-                    let local = settle(p, segment, &locals);
-                    let sight = see(&local, &locals[*segment as usize], radius);
-                    pass.add(*segment as usize, &sight, cutoff_mm);
+                    let local = settle(p, segment, locals);
+                    let k = *segment as usize;
+                    pass.add(bin(k, &local), &see(&local, &locals[k], tube_radius_mm), cutoff_mm);
                 }
                 pass
             })
             .collect();
-        let mut total = Pass::empty(locals.len());
+        let mut total = Pass::empty(bins);
         chunks.iter().for_each(|c| total.merge(c));
         total
     }
@@ -131,11 +205,11 @@ impl Pass {
         self.psi_slope += w - 4.0 * t * t * keep;
         self.used += 1;
         let r = &sight.row;
-        let h = [r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], sight.residual_mm];
+        let h = [r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], sight.residual_mm];
         let moment = &mut self.moments[segment];
-        for column in 0..9 {
+        for column in 0..=ROWS {
             let scaled = w * h[column];
-            for row in column..9 {
+            for row in column..=ROWS {
                 moment[(row, column)] += scaled * h[row];
             }
         }
@@ -157,21 +231,13 @@ impl Pass {
         parameters: &[Parameter],
     ) -> (DMatrix<f64>, DVector<f64>) {
         let n = parameters.len();
-        let radius = parameters.iter().position(|p| *p == Parameter::TubeRadius);
         let (mut matrix, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
         for (moment, motion) in self.moments.iter().zip(motions) {
             let mut moment = *moment;
             moment.fill_upper_triangle_with_lower_triangle();
-            let mut basis = DMatrix::zeros(8, n);
-            basis.rows_mut(0, 6).copy_from(&motion.twists);
-            if let Some(own) = motion.own_radius {
-                basis[(6, own)] = 1.0;
-            }
-            if let Some(radius) = radius {
-                basis[(7, radius)] = 1.0;
-            }
-            matrix += basis.transpose() * (moment.fixed_view::<8, 8>(0, 0) * &basis);
-            gradient += basis.transpose() * moment.fixed_view::<8, 1>(0, 8);
+            let basis = motion.basis(parameters);
+            matrix += basis.transpose() * (moment.fixed_view::<ROWS, ROWS>(0, 0) * &basis);
+            gradient += basis.transpose() * moment.fixed_view::<ROWS, 1>(0, ROWS);
         }
         (matrix, gradient)
     }
@@ -185,16 +251,34 @@ impl Pass {
     }
 }
 
+impl SegmentMotion {
+    /// How the derivatives that a moment holds follow from the parameters.
+    pub fn basis(&self, parameters: &[Parameter]) -> DMatrix<f64> {
+        let mut basis = DMatrix::zeros(ROWS, parameters.len());
+        basis.rows_mut(0, 6).copy_from(&self.twists);
+        let radius = parameters.iter().position(|p| *p == Parameter::TubeRadius);
+        for (row, own) in [(6, self.own_radius), (7, self.own_ovality), (8, radius)] {
+            if let Some(column) = own {
+                basis[(row, column)] = 1.0;
+            }
+        }
+        basis
+    }
+}
+
 fn prepare(model: &TubeModel) -> Vec<Local> {
-    let local = |s: &crate::tube::Segment| Local {
+    let spine = model.spine();
+    let local = |(k, s): (usize, &crate::tube::Segment)| Local {
         to_local: s.start.inverse(),
         length_mm: s.length_mm,
         arc: match s.kind {
-            SegmentKind::Arc { radius_mm, angle_rad } => Some((radius_mm, angle_rad)),
+            SegmentKind::Arc { radius_mm, angle_rad } => {
+                Some(Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] })
+            }
             SegmentKind::Line => None,
         },
     };
-    model.spine().segments().iter().map(local).collect()
+    spine.segments().iter().enumerate().map(local).collect()
 }
 
 /// Moves a point along the tube to the segment it faces; returns it in that segment's frame.
@@ -219,13 +303,25 @@ fn settle(p: &Point3<f64>, segment: &mut u32, locals: &[Local]) -> Point3<f64> {
 }
 
 impl Local {
+    /// Distance along the segment of the point's foot, clamped to it.
+    fn along_mm(&self, p: &Point3<f64>) -> f64 {
+        match &self.arc {
+            None => p.x.clamp(0.0, self.length_mm),
+            Some(arc) => {
+                let turn = p.x.atan2(arc.radius_mm - p.y).rem_euclid(std::f64::consts::TAU);
+                (turn * arc.radius_mm).min(self.length_mm)
+            }
+        }
+    }
+
     /// Before (-1), on (0) or after (1) the segment.
     fn side(&self, p: &Point3<f64>) -> i32 {
-        match self.arc {
+        match &self.arc {
             None => i32::from(p.x > self.length_mm) - i32::from(p.x < 0.0),
-            Some((radius, angle)) => {
+            Some(arc) => {
+                let angle = arc.angle_rad;
                 // Turn measured from the middle of the gap opposite to the arc, so that it wraps there.
-                let turn = p.x.atan2(radius - p.y);
+                let turn = p.x.atan2(arc.radius_mm - p.y);
                 let turn = if turn < (angle / 2.0 - std::f64::consts::PI) {
                     turn + std::f64::consts::TAU
                 } else {
@@ -238,26 +334,45 @@ impl Local {
 }
 
 fn see(p: &Point3<f64>, local: &Local, tube_radius_mm: f64) -> Sight {
-    match local.arc {
+    match &local.arc {
         None => {
             let distance = p.y.hypot(p.z).max(1e-12);
             let (my, mz) = (p.y / distance, p.z / distance);
-            let row = [0.0, -my, -mz, 0.0, p.x * mz, -p.x * my, 0.0, -1.0];
+            let row = [0.0, -my, -mz, 0.0, p.x * mz, -p.x * my, 0.0, 0.0, -1.0];
             Sight { residual_mm: distance - tube_radius_mm, row }
         }
-        Some((radius, _)) => {
-            let (qx, qy) = (p.x, p.y - radius);
-            let ring = qx.hypot(qy).max(1e-12);
-            let (ux, uy) = (qx / ring, qy / ring);
-            let outward = ring - radius;
-            let distance = outward.hypot(p.z).max(1e-12);
-            let in_plane = outward / distance;
-            let (mx, my, mz) = (in_plane * ux, in_plane * uy, p.z / distance);
-            let own = in_plane * (-uy - 1.0);
-            let moment = [p.y * mz - p.z * my, p.z * mx - p.x * mz, p.x * my - p.y * mx];
-            let row = [-mx, -my, -mz, -moment[0], -moment[1], -moment[2], own, -1.0];
-            Sight { residual_mm: distance - tube_radius_mm, row }
-        }
+        Some(arc) => see_arc(p, arc, tube_radius_mm),
+    }
+}
+
+/// In the arc's frame, with section coordinates (outward, z) around the spine. The section's radius is the tube's plus
+/// e cos 2 psi; the residual's gradient is the section's radial direction less r'(psi) / rho times the tangential one.
+fn see_arc(p: &Point3<f64>, arc: &Arc, tube_radius_mm: f64) -> Sight {
+    let (qx, qy) = (p.x, p.y - arc.radius_mm);
+    let ring = qx.hypot(qy).max(1e-12);
+    let (ux, uy) = (qx / ring, qy / ring);
+    let outward = ring - arc.radius_mm;
+    let distance = outward.hypot(p.z).max(1e-12);
+    let (cos, sin) = (outward / distance, p.z / distance);
+    let ramp = arc.ramp(ux.atan2(-uy).rem_euclid(std::f64::consts::TAU), tube_radius_mm);
+    let cos_two = ramp * (cos * cos - sin * sin);
+    let slope = -4.0 * arc.ovality_mm * ramp * sin * cos / distance;
+    // Along the section: outward and z components of the gradient.
+    let (along_outward, along_z) = (cos + slope * sin, sin - slope * cos);
+    let (mx, my, mz) = (along_outward * ux, along_outward * uy, along_z);
+    let own = along_outward * (-uy - 1.0);
+    let moment = [p.y * mz - p.z * my, p.z * mx - p.x * mz, p.x * my - p.y * mx];
+    let row = [-mx, -my, -mz, -moment[0], -moment[1], -moment[2], own, -cos_two, -1.0];
+    Sight { residual_mm: distance - tube_radius_mm - arc.ovality_mm * cos_two, row }
+}
+
+impl Arc {
+    /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
+    /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
+    /// speed of convergence.
+    fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
+        let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
+        (from_end / (OVAL_RAMP_RADII * tube_radius_mm)).clamp(0.0, 1.0)
     }
 }
 
@@ -286,6 +401,7 @@ mod tests {
                 last_length_mm: 50.0,
             },
             tube_radius_mm: 10.0,
+            ovality_mm: vec![0.0; 3],
             common_radius,
         }
     }
@@ -310,7 +426,7 @@ mod tests {
             let cutoff = 1e6;
             let pass = sample.pass(&model, cutoff);
             let (_, gradient) = pass.normal_equations(&model.motions(&parameters), &parameters);
-            let distance = |m: &TubeModel| m.spine().closest(&p).distance_mm - m.tube_radius_mm;
+            let distance = |m: &TubeModel| Sample::new(vec![p], m).residuals(m)[0];
             let r = distance(&model);
             prop_assume!(r.abs() > 1e-3);
             let h = 1e-6;

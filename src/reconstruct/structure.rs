@@ -3,14 +3,15 @@
 //! criterion): a bend dropped, two merged into one, one put in where the residuals show a kink.
 
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
-use super::evidence;
+use super::evidence::{self, Joint};
 use super::fit::{Effort, Fit, RadiusPrior, fit};
 use super::model::TubeModel;
 use super::moments::Sample;
 use super::simplify::simplify;
-use crate::tube::{Bend, SegmentKind};
+use crate::tube::{Bend, Segment};
 
 /// Tolerances of the polygon in tube radii; the spine's own shrinkage in bends is 0.038 (paper 000, section 3.2).
 const TOLERANCES: [f64; 4] = [0.03, 0.05, 0.08, 0.13];
@@ -20,6 +21,12 @@ const ARC_FACTOR: f64 = 2.5;
 
 /// First cut-off of residuals in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
+
+/// First cut-off after a small change of the structure.
+const CHANGE_CUTOFF: f64 = 0.15;
+
+/// A change must gain this much, or rounding could turn it back for ever.
+const LEAST_GAIN: f64 = 1e-6;
 
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
@@ -32,20 +39,25 @@ const MERGE_RAD: f64 = 0.6;
 
 /// Length of a station of the residuals in tube radii, and the evidence that makes a bend be tried there.
 const STATION_RADII: f64 = 1.0;
-const KINK_CHI2: f64 = 25.0;
+const JOINT_GAIN: f64 = 40.0;
 
-/// Kinks tried per round, and rounds.
-const KINKS: usize = 3;
+/// Joints tried per round, and rounds.
+const JOINTS: usize = 3;
 const ROUNDS: usize = 40;
 
-/// First angle of a bend that is tried.
-const TRIAL_RAD: f64 = 0.02;
+/// A bend this much wider than the mean may be two.
+const WIDE: f64 = 1.3;
+
+/// Smallest first angle of a bend that is tried.
+const TRIAL_RAD: f64 = 0.01;
 
 /// A fitted structure.
 #[derive(Debug, Clone)]
 pub struct Candidate {
     /// The fit to the sample.
     pub fit: Fit,
+    /// The sample with each point at its segment.
+    sample: Sample,
     /// Information criterion: smaller is better.
     pub score: f64,
     /// Expectation of the bend radii that it was fitted with.
@@ -65,49 +77,54 @@ struct Jury<'a> {
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -> Option<Candidate> {
     let mut jury = Jury { sample, sigma_mm: 0.0, correlation: 1.0, prior: None };
-    let mut fits: Vec<Fit> = Vec::new();
+    let mut fits: Vec<(Fit, Sample)> = Vec::new();
     for tolerance in TOLERANCES {
         let kept: Vec<Point3<f64>> =
             simplify(polygon, tolerance * radius_mm).into_iter().map(|i| polygon[i]).collect();
         let limits = Limits { tolerance_mm: ARC_FACTOR * tolerance * radius_mm, min_radius_mm: radius_mm };
         let Some((lra, start)) = approximate(&kept, limits) else { continue };
-        let model = TubeModel { start, lra, tube_radius_mm: radius_mm, common_radius: false };
-        fits.push(jury.fit(&model));
+        let model = TubeModel::round(start, lra, radius_mm);
+        fits.push(jury.fit(Sample::new(sample.to_vec(), &model), &model, FIRST_CUTOFF * radius_mm));
     }
-    jury.calibrate(fits.iter().min_by(|a, b| a.sigma_mm.total_cmp(&b.sigma_mm))?);
-    let best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
+    let clearest = fits.iter().min_by(|a, b| a.0.sigma_mm.total_cmp(&b.0.sigma_mm))?;
+    jury.calibrate(&clearest.0, &clearest.1);
+    let mut best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&best.fit.model);
-    let mut best = jury.judge(jury.fit(&best.fit.model));
+    best = jury.judge(jury.refit(&best, &best.fit.model));
     for _ in 0..ROUNDS {
         let Some(better) = jury.improve(&best) else { break };
-        jury.calibrate(&better.fit);
-        best = jury.judge(better.fit);
+        jury.calibrate(&better.fit, &better.sample);
+        best = jury.judge((better.fit, better.sample));
     }
-    let common = jury.judge(jury.fit(&with_common_radius(&best.fit.model)));
+    let common = jury.judge(jury.refit(&best, &with_common_radius(&best.fit.model)));
     Some(if common.score < best.score { common } else { best })
 }
 
 impl Jury<'_> {
-    fn fit(&self, model: &TubeModel) -> Fit {
-        let cutoff_mm = FIRST_CUTOFF * model.tube_radius_mm;
-        let effort = Effort { cutoff_mm, rounds: 4, steps: 30, prior: self.prior };
-        fit(&mut Sample::new(self.sample.to_vec(), model), model, effort)
+    fn fit(&self, mut sample: Sample, model: &TubeModel, cutoff_mm: f64) -> (Fit, Sample) {
+        let fit = fit(&mut sample, model, Effort { cutoff_mm, rounds: 4, steps: 30, prior: self.prior });
+        (fit, sample)
     }
 
-    fn judge(&self, fit: Fit) -> Candidate {
-        let pass = Sample::new(self.sample.to_vec(), &fit.model).pass(&fit.model, 6.0 * self.sigma_mm);
+    /// Fits a model that is a small change of the best one's.
+    fn refit(&self, best: &Candidate, model: &TubeModel) -> (Fit, Sample) {
+        let cutoff = (CHANGE_CUTOFF * model.tube_radius_mm).max(2.0 * best.fit.cutoff_mm);
+        self.fit(best.sample.follow(&best.fit.model, model), model, cutoff)
+    }
+
+    fn judge(&self, (fit, mut sample): (Fit, Sample)) -> Candidate {
+        let pass = sample.pass(&fit.model, 6.0 * self.sigma_mm);
         let misfit = 2.0 * pass.cost / (self.sigma_mm * self.sigma_mm) / self.correlation;
         let independent = self.sample.len() as f64 / self.correlation;
         let score = misfit + fit.parameters.len() as f64 * independent.ln();
-        Candidate { fit, score, prior: self.prior }
+        Candidate { fit, sample, score, prior: self.prior }
     }
 
     /// Takes noise and correlation from a fit.
-    fn calibrate(&mut self, fit: &Fit) {
-        let sample = Sample::new(self.sample.to_vec(), &fit.model);
+    fn calibrate(&mut self, fit: &Fit, sample: &Sample) {
         let station = STATION_RADII * fit.model.tube_radius_mm;
         self.sigma_mm = fit.sigma_mm;
-        self.correlation = evidence::correlation(&sample, &fit.model, station, fit.cutoff_mm, fit.sigma_mm);
+        self.correlation = evidence::correlation(sample, &fit.model, station, fit.cutoff_mm, fit.sigma_mm);
     }
 
     /// The best of all changes by one bend, when it scores better.
@@ -117,25 +134,34 @@ impl Jury<'_> {
         let dropped =
             (0..n).filter(|&i| model.lra.bends[i].angle_rad < DROP_RAD).map(|i| without_bend(model, i));
         let merged = (1..n).filter_map(|i| merged(model, i));
-        let inserted = self.kinks(&best.fit).into_iter().map(|(at, offset)| with_bend(model, at, &offset));
-        let tried = dropped.chain(merged).chain(inserted.flatten());
+        let joints = self.joints(best);
+        let inserted = joints.iter().flat_map(|j| with_bend(model, j));
+        let split = joints.iter().flat_map(|j| split(model, j));
+        let doubled = (0..n).filter_map(|i| doubled(model, i));
+        let tried: Vec<TubeModel> =
+            dropped.chain(merged).chain(inserted).chain(split).chain(doubled).collect();
         tried
-            .map(|m| self.judge(self.fit(&m)))
-            .filter(|c| c.score < best.score)
+            .into_par_iter()
+            .map(|m| self.judge(self.refit(best, &m)))
+            .collect::<Vec<_>>()
+            .into_iter()
+            .filter(|c| c.score < best.score - LEAST_GAIN)
             .min_by(|a, b| a.score.total_cmp(&b.score))
     }
 
-    /// Places where the points lie beside the model, the clearest first, no two close together.
-    fn kinks(&self, fit: &Fit) -> Vec<(f64, Vector3<f64>)> {
-        let sample = Sample::new(self.sample.to_vec(), &fit.model);
-        let station = STATION_RADII * fit.model.tube_radius_mm;
-        let mut offsets = evidence::offsets(&sample, &fit.model, station, 4.0 * fit.cutoff_mm, self.sigma_mm);
-        offsets.retain(|o| o.chi2 > KINK_CHI2 * self.correlation);
-        offsets.sort_by(|a, b| b.chi2.total_cmp(&a.chi2).then(a.at_mm.total_cmp(&b.at_mm)));
-        let mut out: Vec<(f64, Vector3<f64>)> = Vec::new();
-        for o in offsets {
-            if out.len() < KINKS && out.iter().all(|(at, _)| (at - o.at_mm).abs() > 3.0 * station) {
-                out.push((o.at_mm, o.offset));
+    /// Places where a joint would help, the most helpful first, no two close together.
+    fn joints(&self, best: &Candidate) -> Vec<Joint> {
+        let radius = best.fit.model.tube_radius_mm;
+        let cutoff = 3.0 * best.fit.cutoff_mm;
+        let station = STATION_RADII * radius;
+        let mut joints =
+            evidence::joints(&mut best.sample.clone(), &best.fit, station, cutoff, self.sigma_mm);
+        joints.retain(|j| j.gain > JOINT_GAIN * self.correlation);
+        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
+        let mut out: Vec<Joint> = Vec::new();
+        for joint in joints {
+            if out.len() < JOINTS && out.iter().all(|o| (joint.at_mm - o.at_mm).abs() > 2.0 * radius) {
+                out.push(joint);
             }
         }
         out
@@ -165,10 +191,16 @@ fn with_common_radius(model: &TubeModel) -> TubeModel {
 /// The tube with bend `i` pulled straight.
 fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
     let mut out = model.clone();
-    let bend = &mut out.lra.bends[i];
-    bend.length_mm += bend.radius_mm * bend.angle_rad;
-    bend.angle_rad = 0.0;
-    out.lra = out.lra.merged();
+    let gone = out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
+    let length = gone.length_mm + gone.radius_mm * gone.angle_rad;
+    match out.lra.bends.get_mut(i) {
+        Some(next) => {
+            next.length_mm += length;
+            next.rotation_rad += gone.rotation_rad;
+        }
+        None => out.lra.last_length_mm += length,
+    }
     turn_into_pose(&mut out);
     out
 }
@@ -193,45 +225,94 @@ fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
     let radius_mm = (arcs + other.length_mm) / angle_rad;
     out.lra.bends[i - 1] = Bend { angle_rad, radius_mm, ..one };
     out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
     if let Some(next) = out.lra.bends.get_mut(i) {
         next.rotation_rad += other.rotation_rad;
     }
     Some(out)
 }
 
-/// The tube with a shallow bend more at (or beside) an arc length, turning against the offset that the points
-/// show there. On an arc the straights beside it are tried.
-fn with_bend(model: &TubeModel, at_mm: f64, offset: &Vector3<f64>) -> Vec<TubeModel> {
+/// The bends at (or just beside) a joint, each as two with a straight between.
+fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
     let spine = model.spine();
-    let segments = spine.segments();
-    let hit = segments.partition_point(|s| s.start_mm + s.length_mm < at_mm).min(segments.len() - 1);
-    let lines = if segments[hit].kind == SegmentKind::Line { vec![hit] } else { vec![hit - 1, hit + 1] };
-    let place = |line: usize| {
-        let segment = &segments[line];
-        let along = (at_mm - segment.start_mm).clamp(0.1 * segment.length_mm, 0.9 * segment.length_mm);
-        insert(model, line / 2, along, &segment.start.inverse_transform_vector(offset))
+    let near = 1.5 * model.tube_radius_mm;
+    let arcs = spine.segments().iter().enumerate().filter(|(k, s)| {
+        let reach = s.start_mm - near..s.start_mm + s.length_mm + near;
+        k % 2 == 1 && s.length_mm > 0.0 && reach.contains(&joint.at_mm)
+    });
+    let apart = |(k, segment): (usize, &Segment)| {
+        let mut out = model.clone();
+        let share = ((joint.at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
+        let whole = out.lra.bends[k / 2];
+        // At least a little apart, also where the bend itself is shorter than that.
+        let length_mm = joint.shift_mm.min(segment.length_mm).max(0.1 * model.tube_radius_mm);
+        out.lra.bends[k / 2].angle_rad *= share;
+        let angle_rad = whole.angle_rad * (1.0 - share);
+        let rotation_rad = joint.turn_rad.x.clamp(-0.5, 0.5);
+        out.lra.bends.insert(k / 2 + 1, Bend { length_mm, rotation_rad, angle_rad, ..whole });
+        out.ovality_mm.insert(k / 2, model.ovality_mm[k / 2]);
+        out
     };
-    lines.into_iter().map(place).collect()
+    arcs.map(apart).collect()
 }
 
-/// Puts a bend into straight `row`; `offset` is seen from that straight's frame, whose y axis points to the centre
-/// of the bend after it.
-fn insert(model: &TubeModel, row: usize, along_mm: f64, offset: &Vector3<f64>) -> TubeModel {
+/// A bend that is much wider than the others as two of the usual radius at its ends.
+fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
+    let whole = model.lra.bends[i];
+    let usual = mean_radius_mm(model)?;
+    if whole.radius_mm < WIDE * usual || whole.angle_rad <= 0.0 {
+        return None;
+    }
+    let mut out = model.clone();
+    let half = Bend { angle_rad: 0.5 * whole.angle_rad, radius_mm: usual, ..whole };
+    let between = (whole.radius_mm - usual) * whole.angle_rad;
+    out.lra.bends[i] = half;
+    out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
+    out.ovality_mm.insert(i, 0.0);
+    Some(out)
+}
+
+/// The tube with the shallow bend that a joint asks for. Where the joint lies on (or near the end of) an arc the
+/// straights beside it are tried.
+fn with_bend(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
+    let spine = model.spine();
+    let segments = spine.segments();
+    let near = 1.5 * model.tube_radius_mm;
+    let lines = segments.iter().enumerate().filter(|(k, s)| {
+        let (from, to) = (s.start_mm - near, s.start_mm + s.length_mm + near);
+        let beside = |arc: Option<&Segment>| {
+            arc.is_some_and(|a| (a.start_mm..=a.start_mm + a.length_mm).contains(&joint.at_mm))
+        };
+        let next_to = (*k > 0 && beside(segments.get(k - 1))) || beside(segments.get(k + 1));
+        k % 2 == 0 && ((from..=to).contains(&joint.at_mm) || next_to)
+    });
+    let place = |(k, segment): (usize, &Segment)| {
+        let along = (joint.at_mm - segment.start_mm).clamp(0.1 * segment.length_mm, 0.9 * segment.length_mm);
+        insert(model, k / 2, along, joint)
+    };
+    lines.map(place).collect()
+}
+
+/// Puts a bend into straight `row`, turning as the joint does.
+fn insert(model: &TubeModel, row: usize, along_mm: f64, joint: &Joint) -> TubeModel {
     let mut out = model.clone();
     let radius_mm = mean_radius_mm(model).unwrap_or(6.0 * model.tube_radius_mm);
-    // The centre lies opposite to the offset. The row's frame has its rotation applied already.
-    let turn = (-offset.z).atan2(-offset.y);
+    let angle_rad = joint.turn_rad.yz().norm().clamp(TRIAL_RAD, 20.0 * TRIAL_RAD);
+    // The plane's normal (0, y, z) is the frame's z axis rolled about x.
+    let roll = (-joint.turn_rad.y).atan2(joint.turn_rad.z);
     let before = out.lra.bends.get(row).map_or(0.0, |b| b.rotation_rad);
-    let bend = Bend { length_mm: along_mm, rotation_rad: before + turn, angle_rad: TRIAL_RAD, radius_mm };
-    let used = along_mm + radius_mm * TRIAL_RAD;
+    let half = 0.5 * radius_mm * angle_rad;
+    let bend =
+        Bend { length_mm: (along_mm - half).max(0.0), rotation_rad: before + roll, angle_rad, radius_mm };
     match out.lra.bends.get_mut(row) {
         Some(next) => {
-            next.length_mm = (next.length_mm - used).max(0.0);
-            next.rotation_rad = -turn;
+            next.length_mm = (next.length_mm - along_mm - half).max(0.0);
+            next.rotation_rad = -roll;
         }
-        None => out.lra.last_length_mm = (out.lra.last_length_mm - used).max(0.0),
+        None => out.lra.last_length_mm = (out.lra.last_length_mm - along_mm - half).max(0.0),
     }
     out.lra.bends.insert(row, bend);
+    out.ovality_mm.insert(row, 0.0);
     turn_into_pose(&mut out);
     out
 }

@@ -94,6 +94,7 @@ impl FromStr for Fault {
 #[derive(Debug)]
 pub struct SimulatedBender {
     model: Arc<Mutex<MachineModel>>,
+    shared: Arc<Shared>,
     address: SocketAddr,
     tasks: [JoinHandle<()>; 2],
 }
@@ -123,13 +124,18 @@ impl SimulatedBender {
             }
         });
         let shared = Arc::new(Shared { model: Arc::clone(&model), fault, mute: Mutex::new(false) });
-        let serving = tokio::spawn(async move { serve(listener, shared).await });
-        Ok(SimulatedBender { model, address, tasks: [cycle, serving] })
+        let serving = tokio::spawn(serve(listener, Arc::clone(&shared)));
+        Ok(SimulatedBender { model, shared, address, tasks: [cycle, serving] })
     }
 
     /// Where it listens.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// Answers again after `silent-after-commit`.
+    pub fn unmute(&self) {
+        *lock(&self.shared.mute) = false;
     }
 
     /// Looks at the machine, or acts as its operator.

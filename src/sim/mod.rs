@@ -2,8 +2,6 @@
 
 pub mod bender;
 pub mod bender_server;
-mod forming;
+pub mod forming;
 pub mod population;
 pub mod scan;
-
-pub use forming::{FormedTube, Plant};

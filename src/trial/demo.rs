@@ -16,7 +16,7 @@ use crate::config::Mode;
 use crate::correct::Verdict;
 use crate::inspect;
 use crate::journal::Journal;
-use crate::sim::FormedTube;
+use crate::sim::forming::FormedTube;
 use crate::tube::Nominal;
 
 /// A part that is not good by then shows that something is wrong.

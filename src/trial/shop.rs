@@ -10,8 +10,8 @@ use crate::bender::Profile;
 use crate::cloud::write_ply;
 use crate::sim::bender::MachineModel;
 use crate::sim::bender_server::SimulatedBender;
+use crate::sim::forming::{FormedTube, Plant};
 use crate::sim::scan::{ScanSettings, TubeShape, scan};
-use crate::sim::{FormedTube, Plant};
 use crate::tube::Nominal;
 
 /// What a shop that knows its tubes reckons with when it cuts them: arcs come out this much longer.

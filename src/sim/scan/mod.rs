@@ -1,8 +1,8 @@
 //! The simulated scan arm: a hand-guided laser line sweeping over a bent tube.
 //!
 //! Stripes of light cross the tube; along each stripe, rays are cast at regular steps against the exact surface
-//! ([`solid`]), so a point before noise lies on the ideal tube to the last digit, and whatever stands in front hides
-//! what is behind. [`sweep`] adds what spoils real scans: noise that grows at grazing incidence, dropouts, flying
+//! (`solid`), so a point before noise lies on the ideal tube to the last digit, and whatever stands in front hides
+//! what is behind. `sweep` adds what spoils real scans: noise that grows at grazing incidence, dropouts, flying
 //! points, patches without data, a table and V-blocks. Shares no code with the estimators.
 
 mod props;

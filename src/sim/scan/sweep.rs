@@ -26,7 +26,7 @@ const MOST_NOISE: f64 = 3.0;
 /// With a table, passes tilt by no more than this from upright.
 const STEEPEST_PASS_RAD: f64 = 0.96;
 /// Points around the tube that are scanned with it, in tube radii.
-const MARGIN_RADII: f64 = 3.0;
+const MARGIN_RADII: f64 = 1.5;
 
 /// A point and what it is.
 pub(super) type Hit = (Point3<f64>, PointKind);

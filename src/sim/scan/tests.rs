@@ -242,3 +242,60 @@ fn every_tube_of_the_population_scans() {
         }
     }
 }
+
+#[test]
+fn a_cast_ray_meets_what_small_steps_along_it_meet() {
+    let shape = bracket(1.0);
+    let spine = Spine::from_lra(&shape.lra, Frame::identity());
+    let solid = Solid::new(&shape, &spine);
+    let all: Vec<usize> = (0..5).collect();
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut outside = 0;
+    for _ in 0..400 {
+        let target = spine.point_at(rng.random::<f64>() * spine.length_mm());
+        let mut normal = || rng.sample::<f64, _>(StandardNormal);
+        let direction = Vector3::new(normal(), normal(), normal()).normalize();
+        let aside = Vector3::new(normal(), normal(), normal()) * 10.0;
+        let ray = solid::Ray { origin: target + aside - direction * 500.0, direction };
+        // Steps of 0.2 mm up to the first point within the tube (or the ball about an end).
+        let inside = |t: &f64| spine.closest(&ray.at(*t)).distance_mm < 12.5;
+        let met = (0..5000).map(|i| f64::from(i) * 0.2).find(inside);
+        match solid.cast(&ray, &all, 1000.0) {
+            solid::Cast::Outside { t, cosine } => {
+                outside += 1;
+                let p = ray.at(t);
+                let closest = spine.closest(&p);
+                assert!((closest.distance_mm - 12.5).abs() < 1e-9);
+                let slope = (p - closest.point).dot(&ray.direction) / 12.5;
+                assert!((slope + cosine).abs() < 1e-4, "{slope} {cosine}");
+                // Only the ball beyond an open end may be passed through.
+                let met = met.unwrap();
+                let passed = spine.closest(&ray.at(met)).arc_length_mm;
+                let through_end = passed == 0.0 || passed == spine.length_mm();
+                assert!(through_end || (t <= met && met - t < 0.2 + 1e-9), "{t} but {met}");
+            }
+            solid::Cast::Miss => {
+                let end = |t| [0.0, spine.length_mm()].contains(&spine.closest(&ray.at(t)).arc_length_mm);
+                assert!(met.is_none_or(end), "missed at {met:?}");
+            }
+            solid::Cast::Blocked(_) => {}
+        }
+    }
+    assert!(outside > 200, "{outside}");
+}
+
+#[test]
+fn the_crown_of_the_tube_has_no_gaps() {
+    for scale in [0.1, 1.0] {
+        let shape = bracket(scale);
+        let got = scan(&shape, &ScanSettings { views: 3, ..clean(40_000) }, 2);
+        let bins = 200;
+        let mut count = vec![0; bins + 1];
+        for p in &got.points {
+            let share = got.spine.closest(p).arc_length_mm / got.spine.length_mm();
+            count[(share * bins as f64) as usize] += 1;
+        }
+        let least = count[..bins].iter().min().unwrap();
+        assert!(*least > 60, "{least} points in a bin that should have about 200");
+    }
+}

@@ -1,0 +1,80 @@
+//! `benderd simulate bender` as a user starts and stops it.
+
+use std::io::{BufRead as _, BufReader};
+use std::process::{Command, Stdio};
+
+fn benderd() -> Command {
+    Command::new(assert_cmd::cargo::cargo_bin!("benderd"))
+}
+
+#[test]
+fn it_says_where_it_listens_logs_commits_and_stops_on_sigterm() {
+    let folder = tempfile::tempdir().unwrap();
+    let table = folder.path().join("p1.csv");
+    std::fs::write(&table, "y_mm,b_deg,c_deg,radius_mm\n100,0,90,50\n50,0,0,\n").unwrap();
+    let mut bender = benderd()
+        .args(["simulate", "bender", "--on", "127.0.0.1:0", "--program", "p1", "--bends", "1"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = BufReader::new(bender.stdout.take().unwrap()).lines().map(Result::unwrap);
+    let first = said.next().unwrap();
+    let address = first.split("listens on ").nth(1).unwrap().split(';').next().unwrap();
+    let push = benderd()
+        .args(["push", table.to_str().unwrap(), "--bender", "reference-modbus", "--on", address, "--journal"])
+        .arg(folder.path().join("journal.db"))
+        .output()
+        .unwrap();
+    assert!(push.status.success(), "{}", String::from_utf8_lossy(&push.stderr));
+    let commit = said.next().unwrap();
+    assert!(commit.starts_with("table taken over: revision 1, CRC "), "{commit}");
+    assert!(commit.ends_with("program \"p1\", 1 bends"), "{commit}");
+    let killed = Command::new("kill").arg(bender.id().to_string()).status().unwrap();
+    assert!(killed.success());
+    assert_eq!(said.next().unwrap(), "stopped");
+    assert!(bender.wait().unwrap().success());
+}
+
+#[test]
+fn push_goes_on_when_nobody_reads_what_it_says() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let profile = benderd::bender::Profile::load("reference-modbus").unwrap();
+    let model = benderd::sim::bender::MachineModel::new(profile, "p1", 1);
+    let bender = runtime.block_on(async {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        benderd::sim::bender_server::SimulatedBender::start(listener, model, None, |_| ()).unwrap()
+    });
+    let folder = tempfile::tempdir().unwrap();
+    let table = folder.path().join("p1.csv");
+    std::fs::write(&table, "y_mm,b_deg,c_deg,radius_mm\n100,0,90,50\n50,0,0,\n").unwrap();
+    let mut push = benderd()
+        .args(["push", table.to_str().unwrap(), "--bender", "reference-modbus", "--journal"])
+        .arg(folder.path().join("journal.db"))
+        .args(["--on", &bender.address().to_string()])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop((push.stdout.take(), push.stderr.take()));
+    assert_eq!(push.wait().unwrap().code(), Some(0));
+    assert!(bender.with(|m| m.active_table()).is_some());
+}
+
+#[test]
+fn what_cannot_be_simulated_is_one_clear_error() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    for (args, said) in [
+        (["--on", &address], "cannot listen"),
+        (["--fault", "sulking"], "unknown fault \"sulking\", known are silent, late:MS"),
+        (["--fault", "late:soon"], "milliseconds must be a whole number"),
+        (["--bends", "41"], "--bends 41: profile reference-modbus has room for 40"),
+        (["--program", "Bügel"], "allowed are 1 to 32 ASCII characters"),
+        (["--profile", "nothing-like-it"], "shipped: reference-modbus"),
+    ] {
+        let output = benderd().args(["simulate", "bender"]).args(args).output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {stderr}");
+        assert!(stderr.contains(said), "{args:?}: {stderr}");
+    }
+}
