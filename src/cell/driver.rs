@@ -138,7 +138,7 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
     pub async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
         let mut stopping = false;
         self.take(Event::Start).await;
-        while !(stopping && !matches!(self.cell.state(), State::Delivering(_))) {
+        while !stopping || matches!(self.cell.state(), State::Delivering(_)) {
             // The next scan could be one that should have been filed: a person must look before it is taken.
             if let Some(reason) = self.filing_error.take_if(|_| self.cell.wants_scan()) {
                 self.take(Event::FilingFailed(reason)).await;

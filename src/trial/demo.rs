@@ -131,8 +131,8 @@ impl Operator<'_> {
         Err(TrialError::Held("the tube could not be measured".into()))
     }
 
-    /// Puts the part on record and says whether it is good. A tail that is off is the
-    /// operator's to cut: no feed corrects it.
+    /// Puts the part on record and says whether it is good. A tube of the
+    /// wrong length is the operator's to cut: no feed corrects it.
     fn note(
         &mut self,
         number: usize,
@@ -154,16 +154,14 @@ impl Operator<'_> {
             inspection: (**inspection).clone(),
             next: (answer.verdict == Verdict::Correct).then(|| answer.commanded.clone()),
         };
-        let off_mm = part.inspection.last_length_mm.as_ref().and_then(|c| c.deviation);
-        let off_mm = off_mm.filter(|off| off.abs() > self.shop.cut_slack_mm());
-        write!(out, "{}", story::part(&part, off_mm))?;
         // The loop answers for what a table can do; the tail is the cut's matter and must be good as well.
-        let good = part.inspection.verdict == inspect::Verdict::InTolerance;
+        let good = part.inspection.verdict == inspect::Verdict::InTolerance
+            && answer.verdict == Verdict::InTolerance;
+        let off_mm = self.shop.too_long_mm(&part).filter(|_| !good);
+        write!(out, "{}", story::part(&part, off_mm))?;
+        self.shop.cut_longer(-off_mm.unwrap_or(0.0));
         self.parts.push(part);
-        if let Some(off_mm) = off_mm {
-            self.shop.cut_longer(-off_mm);
-        }
-        Ok(good && answer.verdict == Verdict::InTolerance)
+        Ok(good)
     }
 
     async fn wait_for(&mut self, wanted: impl Fn(&State) -> bool) -> Result<(), TrialError> {
