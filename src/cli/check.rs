@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Outcome;
+use super::{Outcome, say};
 use crate::cell::Setup;
 use crate::config::{DaemonConfig, Materials, load_daemon};
 
@@ -47,11 +47,11 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
             crate::config::Mode::Automatic => "automatic",
         };
         let bends = setup.chain.nominal().lra.bends.len();
-        println!("cell {}: {mode}, part {} with {bends} bends", id.name, id.program);
-        println!("  machine {} at {}", setup.profile.name, setup.address);
-        println!("  scans   {}", setup.folder.folder.display());
-        setup.warnings.iter().for_each(|w| println!("  warning: {w}"));
+        say(&format!("cell {}: {mode}, part {} with {bends} bends", id.name, id.program));
+        say(&format!("  machine {} at {}", setup.profile.name, setup.address));
+        say(&format!("  scans   {}", setup.folder.folder.display()));
+        setup.warnings.iter().for_each(|w| say(&format!("  warning: {w}")));
     }
-    println!("{}: good", args.config.display());
+    say(&format!("{}: good", args.config.display()));
     Ok(Outcome::Done)
 }

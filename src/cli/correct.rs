@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use super::Outcome;
+use super::{Outcome, say};
 use crate::config::{Materials, load_part};
 use crate::correct::{Answer, History, Knowledge, Limits, Verdict, learn, step, store};
 
@@ -52,9 +52,9 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     }
     if args.json {
-        println!("{}", serde_json::to_string(&answer)?);
+        say(&serde_json::to_string(&answer)?);
     } else {
-        print!("{}", table(&answer));
+        say(&table(&answer));
     }
     Ok(match answer.verdict {
         Verdict::FirstPiece | Verdict::InTolerance | Verdict::Correct => Outcome::Done,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use super::{Outcome, ScanUnit};
+use super::{Outcome, ScanUnit, say};
 use crate::cloud::read_scan;
 use crate::config::{Materials, load_part};
 use crate::inspect::{Comparison, Inspection, Place, State, Verdict, inspect};
@@ -40,9 +40,9 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     let measured = measured(args, &nominal)?;
     let inspection = inspect(&measured, &nominal).with_context(|| args.scan.display().to_string())?;
     if args.json {
-        println!("{}", serde_json::to_string(&inspection)?);
+        say(&serde_json::to_string(&inspection)?);
     } else {
-        print!("{}", table(&inspection));
+        say(&table(&inspection));
     }
     Ok(if inspection.verdict == Verdict::InTolerance { Outcome::Done } else { Outcome::No })
 }

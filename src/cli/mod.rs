@@ -15,6 +15,7 @@ mod run;
 mod simulate;
 mod simulate_bender;
 
+use std::io::Write;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -82,6 +83,14 @@ pub enum Outcome {
     No,
     /// Exit 3: a delivery's outcome stayed unknown.
     Unknown,
+}
+
+/// Prints to stdout, a line at least, at once. Nobody reading it (`benderd ... | head`) is no reason to stop: `println!`
+/// would panic.
+fn say(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let end = if text.ends_with('\n') { "" } else { "\n" };
+    let _ = write!(out, "{text}{end}").and_then(|()| out.flush());
 }
 
 /// Runs the program's arguments.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, bail};
 use serde::{Deserialize, Serialize};
 
-use super::{Outcome as Exit, push_text};
+use super::{Outcome as Exit, push_text, say};
 use crate::bender::{
     ActiveTable, Bender as _, Intent, IntentLog as _, Job, ModbusLink, Outcome, Profile, Reason, TableId,
     deliver, gate, prepare,
@@ -108,12 +108,6 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         Ending::Delivered(Outcome::Rejected { .. } | Outcome::NotApplied { .. }) => Exit::No,
         Ending::Delivered(Outcome::Unknown { .. }) => Exit::Unknown,
     })
-}
-
-/// To stdout; a delivery goes on when nobody reads what is said (`println!` would panic).
-fn say(text: &str) {
-    let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
 async fn push(args: &Args, link: &mut ModbusLink, mut job: Job, journal: Option<&mut Journal>) -> Report {

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 
-use super::{Outcome, ScanUnit};
+use super::{Outcome, ScanUnit, say};
 use crate::cloud::read_scan;
 use crate::config::{Materials, load_part};
 use crate::reconstruct::{Options, reconstruct};
@@ -41,10 +41,10 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     measured.elapsed_ms = (started.elapsed().as_secs_f64() * 1e4).round() / 10.0;
     measured.scan_sha256 = scan.sha256;
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&measured)?);
+        say(&serde_json::to_string(&measured)?);
     } else {
-        scan.notes.iter().for_each(|note| println!("note: {note}"));
-        print!("{}", table(&measured));
+        scan.notes.iter().for_each(|note| say(&format!("note: {note}")));
+        say(&table(&measured));
     }
     Ok(Outcome::Done)
 }

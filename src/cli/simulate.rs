@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::Subcommand;
 
-use super::{Outcome, simulate_bender};
+use super::{Outcome, say, simulate_bender};
 use crate::cloud::write_scan;
 use crate::config::{Materials, load_part};
 use crate::sim::scan::{Density, PointKind, ScanSettings, TubeShape, scan};
@@ -94,7 +94,7 @@ fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
         bail!("{}: a tube without length cannot be scanned", args.part.display());
     }
     write_scan(&args.out, &got.cloud())?;
-    println!(
+    say(&format!(
         "{}: {} points of {} ({} tube, {} surroundings, {} outliers), true tube radius {} mm",
         args.out.display(),
         got.points.len(),
@@ -103,6 +103,6 @@ fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
         got.count(PointKind::Surroundings),
         got.count(PointKind::Outlier),
         shape.od_mm / 2.0
-    );
+    ));
     Ok(Outcome::Done)
 }

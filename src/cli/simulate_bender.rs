@@ -1,12 +1,10 @@
 //! `benderd simulate bender`: a bender on a socket, until Ctrl-C or SIGTERM.
 
-use std::io::Write as _;
-
 use anyhow::{Context as _, bail};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::Outcome;
+use super::{Outcome, say};
 use crate::bender::Profile;
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::{Fault, SimulatedBender};
@@ -76,10 +74,4 @@ fn describe(event: &MachineEvent) -> String {
             format!("commit refused with code {code} ({}): {id}", crate::bender::Ack::meaning(*code))
         }
     }
-}
-
-/// One line at once, also into a pipe; nobody reading it is no reason to stop.
-fn say(line: &str) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
 use super::format::{Format, detect};
+use super::raw::Raw;
 use super::{CloudError, PointCloud, Unit, ply, text};
 
 /// Fewest points that can be a scan of a tube.
@@ -27,14 +28,6 @@ pub struct Scan {
     /// SHA-256 of the file's bytes, in hex: the scan's identity in the journal.
     pub sha256: String,
     /// What was put right or passed over, for the operator.
-    pub notes: Vec<String>,
-}
-
-/// What a reader hands to the door: points in the file's unit, normals where the file has them.
-#[derive(Debug, Default)]
-pub(super) struct Raw {
-    pub points: Vec<Point3<f64>>,
-    pub normals: Option<Vec<[f32; 3]>>,
     pub notes: Vec<String>,
 }
 

@@ -9,6 +9,7 @@ mod format;
 mod neighbours;
 mod ply;
 mod point_cloud;
+mod raw;
 #[cfg(test)]
 mod tests;
 mod text;

@@ -7,7 +7,7 @@
 use nalgebra::Point3;
 
 use super::CloudError;
-use super::door::Raw;
+use super::raw::Raw;
 
 /// One line of a file.
 pub(super) struct Line<'a> {

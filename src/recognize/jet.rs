@@ -140,7 +140,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn curvatures_of_a_torus(small in 1.0..50.0f64, ratio in 2.5..8.0f64, phi in 0.0..6.28f64) {
+        fn curvatures_of_a_torus(small in 1.0..50.0f64, ratio in 2.5..8.0f64, phi in 0.0..std::f64::consts::TAU) {
             let big = small * ratio;
             let (centre, points) = torus_patch(big, small, phi, 0.1 * small);
             let jet = fit_jet(&centre, &points, 0.1 * small).unwrap();

@@ -48,16 +48,16 @@ pub fn approximate(vertices: &[Point3<f64>], limits: Limits) -> Option<(Lra, Fra
     reached[0] = Some(Reached { arcs: 0, error: 0.0, before: 0, point: vertices[0], arc: None });
     for i in 0..n - 1 {
         let Some(from) = reached[i].clone() else { continue };
-        for j in i + 1..n - 1 {
-            if reached[j].as_ref().is_some_and(|r| r.arcs <= from.arcs) {
+        for (j, to) in reached.iter_mut().enumerate().skip(i + 1) {
+            if to.as_ref().is_some_and(|r| r.arcs <= from.arcs) {
                 continue;
             }
             let Some((arc, point, error)) = edge(vertices, i, &from, j, limits) else { continue };
             let candidate =
                 Reached { arcs: from.arcs + 1, error: from.error + error, before: i, point, arc: Some(arc) };
             let better = |old: &Reached| (candidate.arcs, candidate.error) < (old.arcs, old.error);
-            if reached[j].as_ref().is_none_or(better) {
-                reached[j] = Some(candidate);
+            if to.as_ref().is_none_or(better) {
+                *to = Some(candidate);
             }
         }
     }

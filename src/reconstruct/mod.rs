@@ -146,6 +146,9 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         let bends = best.model.lra.bends.len();
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
+    // Sigmas by what the points say together, not by their number (see `evidence::correlation`).
+    let patch = best.model.tube_radius_mm;
+    best.covariance *= evidence::correlation(&all, &best.model, patch, best.cutoff_mm, best.sigma_mm);
     let mut measured = measure::measure(&mut best, &mut all);
     let residuals_mm = all.residuals(&best.model);
     let mut used: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();

@@ -417,7 +417,7 @@ mod tests {
     proptest! {
         #[test]
         fn derivatives_are_those_of_finite_differences(
-            along in 0.01..0.99f64, around in 0.0..6.28f64, off in -1.0..1.0f64, common in any::<bool>(),
+            along in 0.01..0.99f64, around in 0.0..std::f64::consts::TAU, off in -1.0..1.0f64, common in any::<bool>(),
         ) {
             let model = model(common);
             let parameters = model.parameters();
@@ -445,7 +445,7 @@ mod tests {
         }
 
         #[test]
-        fn settling_from_any_start_finds_the_distance(along in 0.0..1.0f64, around in 0.0..6.28f64, off in -1.0..1.0f64) {
+        fn settling_from_any_start_finds_the_distance(along in 0.0..1.0f64, around in 0.0..std::f64::consts::TAU, off in -1.0..1.0f64) {
             let model = model(false);
             let p = near_surface(&model, along, around, off);
             let mut sample = Sample::new(vec![p], &model);

@@ -167,7 +167,7 @@ mod tests {
 
     #[test]
     fn the_population_is_as_described() {
-        let all: Vec<_> = (0..300).map(random_tube).collect();
+        let all: Vec<_> = (0..100).map(random_tube).collect();
         for specimen in &all {
             let TubeShape { lra, od_mm, .. } = &specimen.shape;
             assert!(lra.validate().is_ok());
@@ -180,11 +180,11 @@ mod tests {
         let share = |n: usize| n as f64 / bends().count() as f64;
         assert!(share(bends().filter(|b| b.angle_rad < 0.1).count()) > 0.05, "shallow bends");
         assert!(share(bends().filter(|b| b.angle_rad > PI).count()) > 0.01, "bends beyond 180 degrees");
-        assert!(bends().filter(|b| b.length_mm == 0.0).count() > 10, "bend on bend");
-        assert!(all.iter().filter(|s| s.shape.lra.bends.len() > 8).count() > 30, "many bends");
+        assert!(bends().filter(|b| b.length_mm == 0.0).count() > 3, "bend on bend");
+        assert!(all.iter().filter(|s| s.shape.lra.bends.len() > 8).count() > 10, "many bends");
         let small = all.iter().filter(|s| s.shape.od_mm < 10.0).count();
         let large = all.iter().filter(|s| s.shape.od_mm > 40.0).count();
-        assert!(small > 40 && large > 40, "{small} small, {large} large");
+        assert!(small > 10 && large > 10, "{small} small, {large} large");
     }
 
     #[test]

@@ -10,7 +10,7 @@ mod header;
 use nalgebra::Point3;
 
 use super::CloudError;
-use super::door::Raw;
+use super::raw::Raw;
 use header::{Element, Encoding, Header, Kind};
 
 /// Reads the vertices of a PLY file.

@@ -1,0 +1,248 @@
+//! What a user relies on of `reconstruct`: simulated tubes come back right, a scan is measured the same whichever way it
+//! lies, and everything that is no scan of one tube is refused with one clear error.
+
+use std::path::Path;
+
+use assert_cmd::Command;
+use benderd::cloud::{PointCloud, write_xyz};
+use benderd::config::{Materials, load_part};
+use benderd::reconstruct::{Options, ReconstructError, reconstruct};
+use benderd::sim::population::random_tube;
+use benderd::sim::scan::{Density, ScanSettings, SimulatedScan, TubeShape, scan};
+use benderd::tube::{Bend, Frame, Lra, MeasuredTube, Nominal, wrap_angle};
+use nalgebra::{Point3, Vector3};
+use tempfile::TempDir;
+
+const PART: &str = "config/parts/bracket-17.toml";
+
+fn nominal() -> Nominal {
+    load_part(Path::new(PART), &Materials::shipped().unwrap()).unwrap()
+}
+
+fn scanned(points: usize, seed: u64) -> SimulatedScan {
+    let part = nominal();
+    let settings = ScanSettings { density: Density::Points(points), ..ScanSettings::default() };
+    scan(&TubeShape::round(part.lra, part.od_mm), &settings, seed)
+}
+
+fn measured(cloud: &PointCloud) -> MeasuredTube {
+    let part = nominal();
+    reconstruct(cloud, &Options { nominal: Some(&part) }).unwrap().measured
+}
+
+#[test]
+fn the_demo_part_comes_back_within_its_sigmas() {
+    let truth = nominal().lra;
+    let mut off: Vec<f64> = Vec::new();
+    for seed in 0..5 {
+        let found = measured(&scanned(15_000, seed).cloud());
+        assert_eq!(found.bends.len(), truth.bends.len());
+        for (m, t) in found.bends.iter().zip(&truth.bends) {
+            off.push((m.angle_rad - t.angle_rad).abs() / m.angle_sigma_rad);
+            off.push((m.radius_mm.unwrap() - t.radius_mm).abs() / m.radius_sigma_mm.unwrap());
+        }
+        for (m, t) in found.bends.iter().zip(&truth.bends).skip(1) {
+            let rotation = wrap_angle(m.rotation_rad.unwrap() - t.rotation_rad).abs();
+            off.push(rotation / m.rotation_sigma_rad.unwrap());
+            off.push((m.length_mm.unwrap() - t.length_mm).abs() / m.length_sigma_mm.unwrap());
+        }
+        assert!((found.tube_radius_mm - 12.7).abs() < 0.01);
+    }
+    let within_two = off.iter().filter(|z| **z < 2.0).count() as f64 / off.len() as f64;
+    assert!(within_two > 0.85, "only {within_two:.2} of the values lie within two sigmas");
+    assert!(off.iter().all(|z| *z < 6.0), "{off:?}");
+}
+
+#[test]
+fn the_end_lengths_are_the_scanned_extent() {
+    let truth = nominal().lra;
+    let found = measured(&scanned(30_000, 3).cloud());
+    assert!((found.bends[0].length_mm.unwrap() - truth.bends[0].length_mm).abs() < 1.0);
+    assert!((found.last_length_mm.unwrap() - truth.last_length_mm).abs() < 1.0);
+}
+
+#[test]
+fn a_moved_scan_is_the_same_tube() {
+    let scan = scanned(12_000, 4);
+    let here = measured(&scan.cloud());
+    let motion = Frame::new(Vector3::new(900.0, -300.0, 50.0), Vector3::new(2.0, 0.4, -1.0));
+    let moved: Vec<Point3<f64>> = scan.points.iter().map(|p| motion * p).collect();
+    let there = measured(&PointCloud::from_points(&moved));
+    for (a, b) in here.bends.iter().zip(&there.bends) {
+        assert!((a.angle_rad - b.angle_rad).abs() < 0.5 * a.angle_sigma_rad);
+    }
+}
+
+#[test]
+fn the_same_scan_gives_the_same_bits_whatever_the_number_of_threads() {
+    let cloud = scanned(8_000, 5).cloud();
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        serde_json::to_string(&pool.install(|| measured(&cloud))).unwrap()
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn a_scan_from_the_other_end_is_turned_round() {
+    let part = nominal();
+    let settings = ScanSettings { density: Density::Points(12_000), ..ScanSettings::default() };
+    let found = measured(&scan(&TubeShape::round(part.lra.reversed(), part.od_mm), &settings, 6).cloud());
+    for (m, t) in found.bends.iter().zip(&part.lra.bends) {
+        assert!((m.angle_rad - t.angle_rad).abs() < 0.005);
+    }
+    assert!(found.reversed.is_some());
+}
+
+/// Structures that once failed: a two degree bend beside a large one, a clamp with its bounds crossed (1034), two
+/// shallow bends taken for one wide one (1002).
+#[test]
+fn tubes_that_once_failed() {
+    for seed in [10, 1002] {
+        let tube = random_tube(seed);
+        let cloud = scan(&tube.shape, &tube.settings, seed).cloud();
+        let found = reconstruct(&cloud, &Options::default()).unwrap();
+        assert_eq!(found.lra.bends.len(), tube.shape.lra.bends.len(), "seed {seed}");
+    }
+    let tube = random_tube(1034);
+    let cloud = scan(&tube.shape, &tube.settings, 1034).cloud();
+    assert!(reconstruct(&cloud, &Options::default()).is_ok());
+}
+
+#[test]
+fn a_half_circle_and_more_than_that() {
+    for angle_deg in [180.0_f64, 230.0] {
+        let bend = |length_mm, angle_deg: f64| Bend {
+            length_mm,
+            rotation_rad: 1.0,
+            angle_rad: angle_deg.to_radians(),
+            radius_mm: 40.0,
+        };
+        let lra = Lra { bends: vec![bend(90.0, 60.0), bend(70.0, angle_deg)], last_length_mm: 80.0 };
+        let settings = ScanSettings { density: Density::Points(10_000), ..ScanSettings::default() };
+        let cloud = scan(&TubeShape::round(lra, 20.0), &settings, 1).cloud();
+        let found = reconstruct(&cloud, &Options::default()).unwrap().measured;
+        let largest = found.bends.iter().map(|b| b.angle_rad.to_degrees()).fold(0.0, f64::max);
+        assert!((largest - angle_deg).abs() < 0.1, "{largest}");
+        assert!(found.intersection_mm.iter().any(Option::is_none), "no corner beside such a bend");
+    }
+}
+
+fn plane() -> Vec<Point3<f64>> {
+    // A lattice with a little waviness, as a table looks to a scanner.
+    let at = |i: i32, j: i32| Point3::new(i as f64, j as f64, 0.02 * f64::from(i * 7 + j * 13).sin());
+    (0..120).flat_map(|i| (0..120).map(move |j| at(i, j))).collect()
+}
+
+#[test]
+fn a_plane_is_no_tube() {
+    let found = reconstruct(&PointCloud::from_points(&plane()), &Options::default());
+    assert!(matches!(found, Err(ReconstructError::NoTube { .. })), "{found:?}");
+}
+
+#[test]
+fn two_tubes_are_named_as_two() {
+    let one = scanned(8_000, 7);
+    let mut points = one.points.clone();
+    points.extend(one.points.iter().map(|p| p + Vector3::new(0.0, 0.0, 400.0)));
+    let found = reconstruct(&PointCloud::from_points(&points), &Options::default());
+    let Err(ReconstructError::SeveralTubes { lengths_mm }) = found else { panic!("{found:?}") };
+    assert_eq!(lengths_mm.len(), 2);
+}
+
+/// Runs the program on a scan file with this content; returns exit status, stdout and stderr.
+fn run(name: &str, content: &[u8], arguments: &[&str]) -> (i32, String, String) {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join(name);
+    std::fs::write(&path, content).unwrap();
+    let mut command = Command::cargo_bin("benderd").unwrap();
+    let out = command.arg("reconstruct").arg(&path).args(arguments).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (out.status.code().unwrap(), text(out.stdout), text(out.stderr))
+}
+
+fn xyz(points: &[Point3<f64>]) -> Vec<u8> {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("scan.xyz");
+    write_xyz(&path, &PointCloud::from_points(points)).unwrap();
+    std::fs::read(path).unwrap()
+}
+
+#[test]
+fn bad_input_gives_one_clear_error_and_status_2() {
+    let good = scanned(6_000, 8).points;
+    let metres: Vec<Point3<f64>> = good.iter().map(|p| p / 1000.0).collect();
+    let mut not_a_number = xyz(&good);
+    not_a_number.extend_from_slice(b"nan 1 2\n");
+    let mut text = xyz(&good);
+    text.extend_from_slice(b"1.0 two 3.0\n");
+    let ply =
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 5000\nproperty float x\nproperty float y\n\
+                property float z\nend_header\n\x01\x02\x03";
+    let cases: [(&str, Vec<u8>, &str); 8] = [
+        ("empty.ply", Vec::new(), "empty"),
+        ("short.ply", ply.to_vec(), "5000"),
+        ("text.xyz", text, "two"),
+        ("nan.xyz", not_a_number, "nan"),
+        ("plane.xyz", xyz(&plane()), "no tube"),
+        ("fifty.xyz", xyz(&good[..50]), "100"),
+        ("metres.xyz", xyz(&metres), "--unit m"),
+        ("scan.docx", b"PK".to_vec(), ".ply"),
+    ];
+    for (name, content, says) in cases {
+        let (status, out, error) = run(name, &content, &["--json"]);
+        assert_eq!(status, 2, "{name}: {error}");
+        assert!(out.is_empty(), "{name}: {out}");
+        assert!(error.starts_with("error: ") && error.contains(name), "{name}: {error}");
+        assert!(error.to_lowercase().contains(says), "{name}: {error}");
+    }
+}
+
+#[test]
+fn json_is_one_object_with_the_contracts_fields() {
+    let (status, out, error) =
+        run("scan.xyz", &xyz(&scanned(6_000, 9).points), &["--json", "--nominal", PART]);
+    assert_eq!((status, error.as_str()), (0, ""));
+    let json: serde_json::Value = serde_json::from_str(&out).unwrap();
+    for field in [
+        "tube_radius_mm",
+        "points_total",
+        "points_used",
+        "residual_median_mm",
+        "elapsed_ms",
+        "scan_sha256",
+        "last_length_mm",
+        "last_length_sigma_mm",
+        "intersection_mm",
+        "intersection_sigma_mm",
+        "warnings",
+        "reversed",
+    ] {
+        assert!(json.get(field).is_some(), "{field} is missing");
+    }
+    assert_eq!(json["bends"].as_array().unwrap().len(), 4);
+    let bend = &json["bends"][1];
+    for field in ["length", "rotation", "angle", "radius"] {
+        let unit = if field == "length" || field == "radius" { "mm" } else { "deg" };
+        assert!(
+            bend[format!("{field}_{unit}")].is_number() && bend[format!("{field}_sigma_{unit}")].is_number()
+        );
+    }
+    assert_eq!(json["scan_sha256"].as_str().unwrap().len(), 64);
+}
+
+/// The real scan is not part of the project: its folder is named by the environment.
+#[test]
+fn a_real_u_shaped_tube_has_two_bends() {
+    let folder = std::env::var("BENDERD_DATA").unwrap_or_else(|_| "../shared".to_owned());
+    let path = Path::new(&folder).join("real/coil_scan00.ply");
+    if !path.exists() {
+        eprintln!("skipped: {} is not there (set BENDERD_DATA)", path.display());
+        return;
+    }
+    let scan = benderd::cloud::read_scan(&path, benderd::cloud::Unit::Metre).unwrap();
+    let found = reconstruct(&scan.cloud, &Options::default()).unwrap().measured;
+    assert_eq!(found.bends.len(), 2);
+    assert!((20.0..25.0).contains(&found.tube_radius_mm), "{}", found.tube_radius_mm);
+    assert!(found.points_used as f64 > 0.95 * found.points_total as f64);
+}
