@@ -1,5 +1,7 @@
 //! The cell's state machine: every state against every event as one table, and what an operator relies on.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::PathBuf;
 use std::time::Duration;
 

@@ -1,6 +1,8 @@
 //! The cell's driver over a real socket: the simulated bender answers on 127.0.0.1, measuring is stood in for by a
 //! script, so that these tests are about what the driver does with results, not about the results.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;

@@ -1,5 +1,7 @@
 //! `benderd run` and `check` as a person and a service manager see them.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::os::unix::net::UnixDatagram;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};

@@ -1,5 +1,7 @@
 //! `benderd demo`: the whole chain on simulated hardware, as a newcomer runs it.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::Path;
 use std::process::{Command, Output};
 

@@ -1,6 +1,5 @@
 //! The demo: the daemon's own cell loop in a simulated shop, part after part, until a part is good.
 
-use std::io::Write;
 use std::time::Duration;
 
 use tokio::sync::{broadcast, mpsc};
@@ -48,8 +47,8 @@ pub struct DemoResult {
     pub in_tolerance: bool,
 }
 
-/// Runs the demo and tells it to `out` as it goes. Leaves no files behind.
-pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult, TrialError> {
+/// Runs the demo and tells it to `say` as it goes, whole lines at a time. Leaves no files behind.
+pub async fn run(demo: &Demo, say: &mut (dyn FnMut(&str) + Send)) -> Result<DemoResult, TrialError> {
     let folder = tempfile::tempdir()?;
     let scans = folder.path().join("scans");
     let settings = FolderSettings {
@@ -59,7 +58,7 @@ pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult
     };
     let source = WatchedFolder::open(settings).await?;
     let mut shop = Shop::open(&demo.nominal, demo.profile.clone(), &scans, demo.seed).await?;
-    write!(out, "{}", story::header(demo, &shop.address()))?;
+    say(&story::header(demo, &shop.address()));
     let journal = folder.path().join("journal.db");
     let identity = Identity {
         name: CELL.into(),
@@ -75,12 +74,12 @@ pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult
     let (commands, receiver) = mpsc::channel(1);
     let running = tokio::spawn(driver.run(receiver));
     let result =
-        Operator { shop: &mut shop, notices, commands: &commands, parts: Vec::new() }.work(out).await;
+        Operator { shop: &mut shop, notices, commands: &commands, parts: Vec::new() }.work(say).await;
     drop(commands);
     let _ = running.await;
     let result = result?;
     let records = Journal::open(&journal)?.verify()?;
-    write!(out, "{}", story::ending(&result, records))?;
+    say(&story::ending(&result, records));
     Ok(result)
 }
 
@@ -93,7 +92,7 @@ struct Operator<'a> {
 }
 
 impl Operator<'_> {
-    async fn work(mut self, out: &mut (dyn Write + Send)) -> Result<DemoResult, TrialError> {
+    async fn work(mut self, say: &mut (dyn FnMut(&str) + Send)) -> Result<DemoResult, TrialError> {
         self.wait_for(|state| *state == State::Disarmed).await?;
         if self.commands.send(Command::Arm).await.is_err() {
             return Err(TrialError::Stopped);
@@ -102,7 +101,7 @@ impl Operator<'_> {
         for number in 1..=MAX_PARTS {
             let tube = self.shop.bend().ok_or(TrialError::NoTable)?;
             let decided = self.scan_until_decided(&tube).await?;
-            let good = self.note(number, &decided, out)?;
+            let good = self.note(number, &decided, say)?;
             self.wait_for(ready).await?;
             if good {
                 return Ok(DemoResult { parts: self.parts, in_tolerance: true });
@@ -137,7 +136,7 @@ impl Operator<'_> {
         &mut self,
         number: usize,
         decided: &Decided,
-        out: &mut (dyn Write + Send),
+        say: &mut (dyn FnMut(&str) + Send),
     ) -> Result<bool, TrialError> {
         let decision = &decided.decision;
         let (Some(in_force), Some(measured), Some(inspection)) =
@@ -158,7 +157,7 @@ impl Operator<'_> {
         let good = part.inspection.verdict == inspect::Verdict::InTolerance
             && answer.verdict == Verdict::InTolerance;
         let off_mm = self.shop.too_long_mm(&part).filter(|_| !good);
-        write!(out, "{}", story::part(&part, off_mm))?;
+        say(&story::part(&part, off_mm));
         self.shop.cut_longer(-off_mm.unwrap_or(0.0));
         self.parts.push(part);
         Ok(good)
