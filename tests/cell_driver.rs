@@ -186,6 +186,7 @@ async fn an_unusable_scan_lies_in_failed_with_its_reason_and_the_cell_goes_on() 
     assert!(cell.exists("failed/one.ply"));
     let why = std::fs::read_to_string(cell.dir.path().join("scans/failed/one.ply.txt")).unwrap();
     assert!(why.contains("no tube in"), "{why}");
+    assert!(kinds(&cell.stop().await).contains(&"refusal"));
 }
 
 #[tokio::test]
