@@ -10,6 +10,7 @@ pub mod crust;
 pub mod cylinder;
 mod direction;
 mod ends;
+mod error;
 mod evidence;
 pub mod fit;
 mod measure;
@@ -20,8 +21,8 @@ pub mod radius;
 pub mod simplify;
 pub mod structure;
 
+pub use error::ReconstructError;
 use nalgebra::Point3;
-use thiserror::Error;
 
 use crate::cloud::PointCloud;
 use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
@@ -48,73 +49,6 @@ pub struct Reconstruction {
     pub residuals_mm: Vec<f64>,
 }
 
-/// Why there is no result.
-#[derive(Debug, Error, PartialEq)]
-pub enum ReconstructError {
-    /// Nothing in the cloud is curved like a tube.
-    #[error(
-        "no tube in the scan: no curvature radius that most of the {points} points agree on; is this a scan of a tube, in the right unit?"
-    )]
-    NoTube {
-        /// Points in the cloud.
-        points: usize,
-    },
-    /// The points on the surface are too few or too scattered.
-    #[error(
-        "the tube's centre line cannot be found: only {found} of {points} points lie on a tube of radius {radius_mm:.2} mm; scan more densely (a point per {wanted_mm:.2} mm or closer)"
-    )]
-    TooSparse {
-        /// Points on a tube.
-        found: usize,
-        /// Points in the cloud.
-        points: usize,
-        /// Radius of that tube.
-        radius_mm: f64,
-        /// Spacing that would do.
-        wanted_mm: f64,
-    },
-    /// More than one tube.
-    #[error("the scan shows {} separate tubes (centre lines of {}); scan one part at a time", .lengths_mm.len(), list(.lengths_mm))]
-    SeveralTubes {
-        /// Lengths of their centre lines.
-        lengths_mm: Vec<f64>,
-    },
-    /// The centre line closes on itself.
-    #[error("the centre line closes on itself after {length_mm:.1} mm: a ring has no ends to measure from")]
-    Ring {
-        /// Its length.
-        length_mm: f64,
-    },
-    /// No arc-line spline follows the centre line.
-    #[error(
-        "the centre line of {length_mm:.1} mm (tube radius {radius_mm:.2} mm) is not made of straights and arcs"
-    )]
-    NotBent {
-        /// Length of the centre line.
-        length_mm: f64,
-        /// Radius of the tube.
-        radius_mm: f64,
-    },
-    /// The fitted tube does not explain the points.
-    #[error(
-        "only {used} of {points} points lie on the tube found (radius {radius_mm:.2} mm, {bends} bends); clear the scene or scan again"
-    )]
-    PoorFit {
-        /// Points on the surface.
-        used: usize,
-        /// Points in the cloud.
-        points: usize,
-        /// Radius of the tube.
-        radius_mm: f64,
-        /// Bends found.
-        bends: usize,
-    },
-}
-
-fn list(lengths: &[f64]) -> String {
-    lengths.iter().map(|l| format!("{l:.0} mm")).collect::<Vec<_>>().join(", ")
-}
-
 /// Spacing of the spine's polygon in tube radii.
 const SPINE_SPACING_RADII: f64 = 0.3;
 
@@ -133,8 +67,12 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     let radius_mm = radius::estimate(cloud).ok_or(ReconstructError::NoTube { points })?;
     let polygon = centre_line(cloud, radius_mm)?;
     let sample: Vec<Point3<f64>> = cloud.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
-    let chosen = structure::choose(&polygon, &sample, radius_mm)
-        .ok_or_else(|| ReconstructError::NotBent { length_mm: crust::length_mm(&polygon), radius_mm })?;
+    let chosen =
+        structure::choose(&polygon, &sample, radius_mm).ok_or_else(|| ReconstructError::NotBent {
+            length_mm: crust::length_mm(&polygon),
+            radius_mm,
+            most: structure::MOST_BENDS,
+        })?;
     let model = chosen.fit.model;
     let mut all = Sample::new(cloud.iter().collect(), &model);
     let mut best = fit(

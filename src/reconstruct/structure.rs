@@ -19,6 +19,9 @@ const TOLERANCES: [f64; 4] = [0.03, 0.05, 0.08, 0.13];
 /// Tolerance of the arcs over that of the polygon.
 const ARC_FACTOR: f64 = 2.5;
 
+/// More bends than this are a coil or a hose, not a bent tube.
+pub const MOST_BENDS: usize = 40;
+
 /// First cut-off of residuals in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
 
@@ -43,10 +46,14 @@ const JOINT_GAIN: f64 = 40.0;
 
 /// Joints tried per round, and rounds.
 const JOINTS: usize = 3;
-const ROUNDS: usize = 40;
+const ROUNDS: usize = 20;
 
 /// A bend this much wider than the mean may be two.
 const WIDE: f64 = 1.3;
+
+/// Steps per round of a fit, and of one that only has to show whether a change is worth it.
+const FULL_STEPS: usize = 30;
+const TRIAL_STEPS: usize = 8;
 
 /// Smallest first angle of a bend that is tried.
 const TRIAL_RAD: f64 = 0.01;
@@ -83,33 +90,38 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
             simplify(polygon, tolerance * radius_mm).into_iter().map(|i| polygon[i]).collect();
         let limits = Limits { tolerance_mm: ARC_FACTOR * tolerance * radius_mm, min_radius_mm: radius_mm };
         let Some((lra, start)) = approximate(&kept, limits) else { continue };
+        if lra.bends.len() > MOST_BENDS {
+            continue;
+        }
         let model = TubeModel::round(start, lra, radius_mm);
-        fits.push(jury.fit(Sample::new(sample.to_vec(), &model), &model, FIRST_CUTOFF * radius_mm));
+        let cutoff = FIRST_CUTOFF * radius_mm;
+        fits.push(jury.fit(Sample::new(sample.to_vec(), &model), &model, cutoff, FULL_STEPS));
     }
     let clearest = fits.iter().min_by(|a, b| a.0.sigma_mm.total_cmp(&b.0.sigma_mm))?;
     jury.calibrate(&clearest.0, &clearest.1);
     let mut best = fits.into_iter().map(|f| jury.judge(f)).min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&best.fit.model);
-    best = jury.judge(jury.refit(&best, &best.fit.model));
+    best = jury.judge(jury.refit(&best, &best.fit.model, FULL_STEPS));
     for _ in 0..ROUNDS {
         let Some(better) = jury.improve(&best) else { break };
-        jury.calibrate(&better.fit, &better.sample);
-        best = jury.judge((better.fit, better.sample));
+        best = jury.judge(jury.refit(&better, &better.fit.model, FULL_STEPS));
+        jury.calibrate(&best.fit, &best.sample);
+        best = jury.judge((best.fit, best.sample));
     }
-    let common = jury.judge(jury.refit(&best, &with_common_radius(&best.fit.model)));
+    let common = jury.judge(jury.refit(&best, &with_common_radius(&best.fit.model), FULL_STEPS));
     Some(if common.score < best.score { common } else { best })
 }
 
 impl Jury<'_> {
-    fn fit(&self, mut sample: Sample, model: &TubeModel, cutoff_mm: f64) -> (Fit, Sample) {
-        let fit = fit(&mut sample, model, Effort { cutoff_mm, rounds: 4, steps: 30, prior: self.prior });
+    fn fit(&self, mut sample: Sample, model: &TubeModel, cutoff_mm: f64, steps: usize) -> (Fit, Sample) {
+        let fit = fit(&mut sample, model, Effort { cutoff_mm, rounds: 4, steps, prior: self.prior });
         (fit, sample)
     }
 
     /// Fits a model that is a small change of the best one's.
-    fn refit(&self, best: &Candidate, model: &TubeModel) -> (Fit, Sample) {
+    fn refit(&self, best: &Candidate, model: &TubeModel, steps: usize) -> (Fit, Sample) {
         let cutoff = (CHANGE_CUTOFF * model.tube_radius_mm).max(2.0 * best.fit.cutoff_mm);
-        self.fit(best.sample.follow(&best.fit.model, model), model, cutoff)
+        self.fit(best.sample.follow(&best.fit.model, model), model, cutoff, steps)
     }
 
     fn judge(&self, (fit, mut sample): (Fit, Sample)) -> Candidate {
@@ -138,11 +150,11 @@ impl Jury<'_> {
         let inserted = joints.iter().flat_map(|j| with_bend(model, j));
         let split = joints.iter().flat_map(|j| split(model, j));
         let doubled = (0..n).filter_map(|i| doubled(model, i));
-        let tried: Vec<TubeModel> =
-            dropped.chain(merged).chain(inserted).chain(split).chain(doubled).collect();
+        let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled);
+        let tried: Vec<TubeModel> = all.filter(|m| m.lra.bends.len() <= MOST_BENDS).collect();
         tried
             .into_par_iter()
-            .map(|m| self.judge(self.refit(best, &m)))
+            .map(|m| self.judge(self.refit(best, &m, TRIAL_STEPS)))
             .collect::<Vec<_>>()
             .into_iter()
             .filter(|c| c.score < best.score - LEAST_GAIN)

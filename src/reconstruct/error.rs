@@ -1,0 +1,72 @@
+//! Why a cloud gave no tube: each reason with its figures and what to do.
+
+use thiserror::Error;
+
+/// Why there is no result.
+#[derive(Debug, Error, PartialEq)]
+pub enum ReconstructError {
+    /// Nothing in the cloud is curved like a tube.
+    #[error(
+        "no tube in the scan: no curvature radius that most of the {points} points agree on; is this a scan of a tube, in the right unit?"
+    )]
+    NoTube {
+        /// Points in the cloud.
+        points: usize,
+    },
+    /// The points on the surface are too few or too scattered.
+    #[error(
+        "the tube's centre line cannot be found: only {found} of {points} points lie on a tube of radius {radius_mm:.2} mm; scan more densely (a point per {wanted_mm:.2} mm or closer)"
+    )]
+    TooSparse {
+        /// Points on a tube.
+        found: usize,
+        /// Points in the cloud.
+        points: usize,
+        /// Radius of that tube.
+        radius_mm: f64,
+        /// Spacing that would do.
+        wanted_mm: f64,
+    },
+    /// More than one tube.
+    #[error("the scan shows {} separate tubes (centre lines of {}); scan one part at a time", .lengths_mm.len(), list(.lengths_mm))]
+    SeveralTubes {
+        /// Lengths of their centre lines.
+        lengths_mm: Vec<f64>,
+    },
+    /// The centre line closes on itself.
+    #[error("the centre line closes on itself after {length_mm:.1} mm: a ring has no ends to measure from")]
+    Ring {
+        /// Its length.
+        length_mm: f64,
+    },
+    /// No arc-line spline follows the centre line.
+    #[error(
+        "the centre line of {length_mm:.1} mm (tube radius {radius_mm:.2} mm) is not made of straights and arcs"
+    )]
+    NotBent {
+        /// Length of the centre line.
+        length_mm: f64,
+        /// Radius of the tube.
+        radius_mm: f64,
+        /// Most bends that are looked for.
+        most: usize,
+    },
+    /// The fitted tube does not explain the points.
+    #[error(
+        "only {used} of {points} points lie on the tube found (radius {radius_mm:.2} mm, {bends} bends); clear the scene or scan again"
+    )]
+    PoorFit {
+        /// Points on the surface.
+        used: usize,
+        /// Points in the cloud.
+        points: usize,
+        /// Radius of the tube.
+        radius_mm: f64,
+        /// Bends found.
+        bends: usize,
+    },
+}
+
+fn list(lengths: &[f64]) -> String {
+    lengths.iter().map(|l| format!("{l:.0} mm")).collect::<Vec<_>>().join(", ")
+}
