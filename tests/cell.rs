@@ -1,5 +1,7 @@
 //! The cell's state machine: every state against every event as one table, and what an operator relies on.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -275,6 +277,13 @@ fn a_cell_comes_up_disarmed_and_writes_nothing_until_armed() {
     b.on(Event::Scan(scan()));
     assert_eq!((b.cell.state(), b.log.len()), (&State::Disarmed, 1));
     assert!(!b.cell.wants_scan());
+}
+
+#[test]
+fn an_order_to_arm_is_not_lost_while_the_machine_is_first_read() {
+    let mut b = Bench::at(Mode::Automatic, "Reading(Contact)").unwrap();
+    b.on(Event::Arm);
+    assert!(matches!(b.read(1)[..], [Action::Decide(_)]));
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! The cell's driver over a real socket: the simulated bender answers on 127.0.0.1, measuring is stood in for by a
 //! script, so that these tests are about what the driver does with results, not about the results.
 
+#![allow(clippy::unwrap_used, clippy::expect_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::PathBuf;
 use std::sync::Mutex;
 use std::time::Duration;
@@ -184,6 +186,7 @@ async fn an_unusable_scan_lies_in_failed_with_its_reason_and_the_cell_goes_on() 
     assert!(cell.exists("failed/one.ply"));
     let why = std::fs::read_to_string(cell.dir.path().join("scans/failed/one.ply.txt")).unwrap();
     assert!(why.contains("no tube in"), "{why}");
+    assert!(kinds(&cell.stop().await).contains(&"refusal"));
 }
 
 #[tokio::test]

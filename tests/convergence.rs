@@ -3,7 +3,7 @@
 //! Truth is the formed tube itself, judged without noise on angles and check points of the demo part's
 //! tolerance; its last end is left to the cut. `cargo test --test convergence -- --nocapture` prints the table.
 
-#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // clippy does not count the helpers of an integration test as test code
 
 mod common;
 

@@ -1,6 +1,8 @@
 //! What a user relies on of `reconstruct`: simulated tubes come back right, a scan is measured the same whichever way it
 //! lies, and everything that is no scan of one tube is refused with one clear error.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::Path;
 
 use assert_cmd::Command;

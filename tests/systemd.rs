@@ -1,5 +1,7 @@
 //! The unit files as systemd itself sees them. Skipped, saying so, where systemd's tools are missing.
 
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // clippy does not count the helpers of an integration test as test code
+
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 

@@ -21,7 +21,7 @@ pub fn measure(path: &Path, unit: Unit, nominal: Option<&Nominal>) -> Result<Mea
     let found = reconstruct(&scan.cloud, &Options { nominal });
     let mut measured = found.map_err(|e| format!("{}: {e}", path.display()))?.measured;
     measured.scan_sha256 = scan.sha256;
-    measured.elapsed_ms = begin.elapsed().as_secs_f64() * 1000.0;
+    measured.elapsed_ms = (begin.elapsed().as_secs_f64() * 1e4).round() / 10.0;
     measured.warnings.extend(scan.notes);
     Ok(measured)
 }

@@ -242,9 +242,14 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
                 let content = json!({ "machine": cell, "bent_with": table, "measured": measured });
                 record(&mut self.journal, "measurement", &content);
             }
+            Event::MeasureFailed(ticket, why) if self.cell.is_current(*ticket) => {
+                tracing::warn!(cell, "scan refused: {why}");
+                record(&mut self.journal, "refusal", &json!({ "machine": cell, "why": why }));
+            }
             Event::Decided(ticket, decision) if self.cell.is_current(*ticket) => {
                 let content = json!({ "machine": cell, "answer": decision.answer });
                 record(&mut self.journal, "decision", &content);
+                tracing::info!(cell, verdict = ?decision.answer.verdict, "{}", decision.reasons());
                 self.tell_decision(decision);
             }
             _ => {}

@@ -185,7 +185,7 @@ impl Cell {
         self.now = now;
         match (self.state.clone(), event) {
             (State::Disarmed, Event::Start) => self.read(Purpose::Contact),
-            (State::Disarmed | State::Held(_), Event::Arm) => self.arm(),
+            (State::Disarmed | State::Held(_) | State::Reading(Purpose::Contact), Event::Arm) => self.arm(),
             (_, Event::Disarm) => self.disarm(),
             (state, Event::Tick) if self.wake_at().is_some_and(|at| at <= now) => self.overdue(state),
             (State::Ready | State::InTolerance, Event::Scan(scan)) => self.read(Purpose::Recall(scan)),

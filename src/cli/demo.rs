@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 
-use super::Outcome;
+use super::{Outcome, say};
 use crate::bender::Profile;
 use crate::config::{Document, Materials, load_part, parse_part};
 use crate::trial::{Demo, TrialError, draw, run as run_demo};
@@ -43,7 +43,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     let demo = Demo { nominal, profile: Profile::load("reference-modbus")?, seed: args.seed };
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-    let result = match runtime.block_on(run_demo(&demo, &mut std::io::stdout())) {
+    let result = match runtime.block_on(run_demo(&demo, &mut say)) {
         Ok(result) => result,
         Err(error @ TrialError::Held(_)) => {
             eprintln!("error: {error}");

@@ -5,10 +5,9 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use super::{Outcome, ScanUnit, say};
-use crate::cloud::read_scan;
+use crate::cell::measure;
 use crate::config::{Materials, load_part};
 use crate::inspect::{Comparison, Inspection, Place, State, Verdict, inspect};
-use crate::reconstruct::{Options, reconstruct};
 use crate::tube::{MeasuredTube, Nominal};
 
 /// Arguments of `benderd inspect`.
@@ -54,13 +53,7 @@ fn measured(args: &Args, nominal: &Nominal) -> anyhow::Result<MeasuredTube> {
         return serde_json::from_str(&text)
             .with_context(|| format!("{file}: not what `reconstruct --json` prints"));
     }
-    let scan = read_scan(&args.scan, args.unit.into())?;
-    let found =
-        reconstruct(&scan.cloud, &Options { nominal: Some(nominal) }).with_context(|| file.to_string())?;
-    let mut measured = found.measured;
-    measured.scan_sha256 = scan.sha256;
-    measured.warnings.extend(scan.notes);
-    Ok(measured)
+    measure(&args.scan, args.unit.into(), Some(nominal)).map_err(anyhow::Error::msg)
 }
 
 fn table(inspection: &Inspection) -> String {

@@ -3,6 +3,7 @@
 //! Cells that may write come up disarmed. SIGUSR1 arms all of them, SIGUSR2 disarms them; `--arm` is for a person
 //! who stands beside the machines.
 
+use std::io::IsTerminal as _;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
@@ -50,10 +51,10 @@ fn start_log() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into());
     let log =
         tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).with_env_filter(filter);
-    if std::env::var_os("JOURNAL_STREAM").is_some() {
-        log.without_time().with_ansi(false).init();
-    } else {
-        log.init();
+    let log = log.with_ansi(std::io::stderr().is_terminal());
+    match std::env::var_os("JOURNAL_STREAM") {
+        Some(_) => log.without_time().init(),
+        None => log.init(),
     }
 }
 

@@ -1,6 +1,5 @@
 //! The demo: the daemon's own cell loop in a simulated shop, part after part, until a part is good.
 
-use std::io::Write;
 use std::time::Duration;
 
 use tokio::sync::{broadcast, mpsc};
@@ -48,8 +47,8 @@ pub struct DemoResult {
     pub in_tolerance: bool,
 }
 
-/// Runs the demo and tells it to `out` as it goes. Leaves no files behind.
-pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult, TrialError> {
+/// Runs the demo and tells it to `say` as it goes, whole lines at a time. Leaves no files behind.
+pub async fn run(demo: &Demo, say: &mut (dyn FnMut(&str) + Send)) -> Result<DemoResult, TrialError> {
     let folder = tempfile::tempdir()?;
     let scans = folder.path().join("scans");
     let settings = FolderSettings {
@@ -59,7 +58,7 @@ pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult
     };
     let source = WatchedFolder::open(settings).await?;
     let mut shop = Shop::open(&demo.nominal, demo.profile.clone(), &scans, demo.seed).await?;
-    write!(out, "{}", story::header(demo, &shop.address()))?;
+    say(&story::header(demo, &shop.address()));
     let journal = folder.path().join("journal.db");
     let identity = Identity {
         name: CELL.into(),
@@ -75,12 +74,12 @@ pub async fn run(demo: &Demo, out: &mut (dyn Write + Send)) -> Result<DemoResult
     let (commands, receiver) = mpsc::channel(1);
     let running = tokio::spawn(driver.run(receiver));
     let result =
-        Operator { shop: &mut shop, notices, commands: &commands, parts: Vec::new() }.work(out).await;
+        Operator { shop: &mut shop, notices, commands: &commands, parts: Vec::new() }.work(say).await;
     drop(commands);
     let _ = running.await;
     let result = result?;
     let records = Journal::open(&journal)?.verify()?;
-    write!(out, "{}", story::ending(&result, records))?;
+    say(&story::ending(&result, records));
     Ok(result)
 }
 
@@ -93,7 +92,7 @@ struct Operator<'a> {
 }
 
 impl Operator<'_> {
-    async fn work(mut self, out: &mut (dyn Write + Send)) -> Result<DemoResult, TrialError> {
+    async fn work(mut self, say: &mut (dyn FnMut(&str) + Send)) -> Result<DemoResult, TrialError> {
         self.wait_for(|state| *state == State::Disarmed).await?;
         if self.commands.send(Command::Arm).await.is_err() {
             return Err(TrialError::Stopped);
@@ -102,7 +101,7 @@ impl Operator<'_> {
         for number in 1..=MAX_PARTS {
             let tube = self.shop.bend().ok_or(TrialError::NoTable)?;
             let decided = self.scan_until_decided(&tube).await?;
-            let good = self.note(number, &decided, out)?;
+            let good = self.note(number, &decided, say)?;
             self.wait_for(ready).await?;
             if good {
                 return Ok(DemoResult { parts: self.parts, in_tolerance: true });
@@ -131,13 +130,13 @@ impl Operator<'_> {
         Err(TrialError::Held("the tube could not be measured".into()))
     }
 
-    /// Puts the part on record and says whether it is good. A tail that is off is the
-    /// operator's to cut: no feed corrects it.
+    /// Puts the part on record and says whether it is good. A tube of the
+    /// wrong length is the operator's to cut: no feed corrects it.
     fn note(
         &mut self,
         number: usize,
         decided: &Decided,
-        out: &mut (dyn Write + Send),
+        say: &mut (dyn FnMut(&str) + Send),
     ) -> Result<bool, TrialError> {
         let decision = &decided.decision;
         let (Some(in_force), Some(measured), Some(inspection)) =
@@ -154,16 +153,14 @@ impl Operator<'_> {
             inspection: (**inspection).clone(),
             next: (answer.verdict == Verdict::Correct).then(|| answer.commanded.clone()),
         };
-        let off_mm = part.inspection.last_length_mm.as_ref().and_then(|c| c.deviation);
-        let off_mm = off_mm.filter(|off| off.abs() > self.shop.cut_slack_mm());
-        write!(out, "{}", story::part(&part, off_mm))?;
         // The loop answers for what a table can do; the tail is the cut's matter and must be good as well.
-        let good = part.inspection.verdict == inspect::Verdict::InTolerance;
+        let good = part.inspection.verdict == inspect::Verdict::InTolerance
+            && answer.verdict == Verdict::InTolerance;
+        let off_mm = self.shop.too_long_mm(&part).filter(|_| !good);
+        say(&story::part(&part, off_mm));
+        self.shop.cut_longer(-off_mm.unwrap_or(0.0));
         self.parts.push(part);
-        if let Some(off_mm) = off_mm {
-            self.shop.cut_longer(-off_mm);
-        }
-        Ok(good && answer.verdict == Verdict::InTolerance)
+        Ok(good)
     }
 
     async fn wait_for(&mut self, wanted: impl Fn(&State) -> bool) -> Result<(), TrialError> {

@@ -36,7 +36,7 @@ pub enum TrialError {
     /// The cell's loop is gone.
     #[error("the cell's loop ended by itself")]
     Stopped,
-    /// No temporary folder, no socket, nobody reading the output.
+    /// No temporary folder, no socket.
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The scan folder.

@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 use tokio::net::TcpListener;
 
 use super::TrialError;
+use super::record::PartRecord;
 use crate::bender::Profile;
 use crate::cloud::write_ply;
 use crate::sim::bender::MachineModel;
 use crate::sim::bender_server::SimulatedBender;
 use crate::sim::forming::{FormedTube, Plant};
 use crate::sim::scan::{ScanSettings, TubeShape, scan};
-use crate::tube::Nominal;
+use crate::tube::{CommandTable, Nominal};
 
 /// What a shop that knows its tubes reckons with when it cuts them: arcs come out this much longer.
 const USUAL_ELONGATION: f64 = 0.012;
@@ -89,9 +90,16 @@ impl Shop {
         }
     }
 
-    /// A tail that is off by less is left to chance; by more, the next tube is cut otherwise.
-    pub fn cut_slack_mm(&self) -> f64 {
-        self.nominal.tolerance.length_mm / 2.0
+    /// By how much the next tube would be cut too long (negative: too short); None when it is not worth the trouble.
+    /// The tail takes up what the cut is off, and what the next table feeds and bends more or less than this one.
+    pub fn too_long_mm(&self, part: &PartRecord) -> Option<f64> {
+        let used_mm = |table: &CommandTable| -> f64 {
+            let radii = self.nominal.lra.bends.iter().map(|b| b.radius_mm);
+            table.bends.iter().zip(radii).map(|(row, radius)| row.length_mm + radius * row.angle_rad).sum()
+        };
+        let more_mm = part.next.as_ref().map_or(0.0, |next| used_mm(next) - used_mm(&part.commanded));
+        let off_mm = part.inspection.last_length_mm.as_ref()?.deviation? - more_mm;
+        (off_mm.abs() > self.nominal.tolerance.length_mm / 2.0).then_some(off_mm)
     }
 
     /// The next tube is cut this much longer (shorter when negative).

@@ -30,7 +30,7 @@ pub fn header(demo: &Demo, address: &str) -> String {
     )
 }
 
-/// After each part. `off_mm`: the tail is that much too long, so the next tube is cut otherwise.
+/// After each part. `off_mm`: the next tube would be that much too long, so it is cut otherwise.
 pub fn part(part: &PartRecord, off_mm: Option<f64>) -> String {
     let mut out = part.table();
     if let Some(off_mm) = off_mm {
@@ -38,7 +38,7 @@ pub fn part(part: &PartRecord, off_mm: Option<f64>) -> String {
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "    the tail is the cut's matter: the operator cuts the next tube {:.1} mm {how}",
+            "    the tail is the cut's matter, no feed corrects it: the operator cuts the next tube {:.1} mm {how}",
             off_mm.abs()
         );
     }
