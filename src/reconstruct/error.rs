@@ -41,7 +41,8 @@ pub enum ReconstructError {
     },
     /// No arc-line spline follows the centre line.
     #[error(
-        "the centre line of {length_mm:.1} mm (tube radius {radius_mm:.2} mm) is not made of straights and arcs"
+        "the centre line of {length_mm:.1} mm (tube radius {radius_mm:.2} mm) is not made of straights and at most \
+        {most} bends: a coil, a hose, or more than one part?"
     )]
     NotBent {
         /// Length of the centre line.
