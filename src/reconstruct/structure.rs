@@ -59,7 +59,7 @@ const WIDE: f64 = 1.3;
 
 /// Steps per round of a fit, and of one that only has to show whether a change is worth it.
 const FULL_STEPS: usize = 30;
-const TRIAL_STEPS: usize = 8;
+const TRIAL_STEPS: usize = 16;
 
 /// Smallest first angle of a bend that is tried.
 const TRIAL_RAD: f64 = 0.01;
