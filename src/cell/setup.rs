@@ -80,10 +80,7 @@ pub struct Setup {
 impl Setup {
     /// Loads all cells, and sees that none is in the way of another and that their folders can be used.
     pub fn load_all(config: &DaemonConfig) -> Result<Vec<Setup>, SetupError> {
-        let materials = match &config.materials {
-            Some(path) => Materials::load(path)?,
-            None => Materials::shipped()?,
-        };
+        let materials = Materials::load(config.materials.as_deref())?;
         let setups =
             config.cells.iter().map(|c| Setup::load(c, &materials)).collect::<Result<Vec<_>, _>>()?;
         places::check(config)?;

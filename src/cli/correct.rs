@@ -30,11 +30,7 @@ pub struct Args {
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let materials = match &args.materials {
-        Some(path) => Materials::load(path)?,
-        None => Materials::shipped()?,
-    };
-    let nominal = load_part(&args.nominal, &materials)?;
+    let nominal = load_part(&args.nominal, &Materials::load(args.materials.as_deref())?)?;
     let text = std::fs::read_to_string(&args.history).with_context(|| args.history.display().to_string())?;
     let history: History =
         serde_json::from_str(&text).with_context(|| format!("{}: not a history", args.history.display()))?;

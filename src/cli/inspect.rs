@@ -31,11 +31,7 @@ pub struct Args {
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let materials = match &args.materials {
-        Some(path) => Materials::load(path)?,
-        None => Materials::shipped()?,
-    };
-    let nominal = load_part(&args.nominal, &materials)?;
+    let nominal = load_part(&args.nominal, &Materials::load(args.materials.as_deref())?)?;
     let measured = measured(args, &nominal)?;
     let inspection = inspect(&measured, &nominal).with_context(|| args.scan.display().to_string())?;
     if args.json {

@@ -1,14 +1,10 @@
 //! `benderd reconstruct`: one scan to LRA.
 
 use std::path::PathBuf;
-use std::time::Instant;
-
-use anyhow::Context;
 
 use super::{Outcome, ScanUnit, say};
-use crate::cloud::read_scan;
+use crate::cell::measure;
 use crate::config::{Materials, load_part};
-use crate::reconstruct::{Options, reconstruct};
 use crate::tube::MeasuredTube;
 
 /// Arguments of `benderd reconstruct`.
@@ -33,17 +29,10 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         Some(path) => Some(load_part(path, &Materials::shipped()?)?),
         None => None,
     };
-    let started = Instant::now();
-    let scan = read_scan(&args.scan, args.unit.into())?;
-    let found = reconstruct(&scan.cloud, &Options { nominal: nominal.as_ref() })
-        .with_context(|| args.scan.display().to_string())?;
-    let mut measured = found.measured;
-    measured.elapsed_ms = (started.elapsed().as_secs_f64() * 1e4).round() / 10.0;
-    measured.scan_sha256 = scan.sha256;
+    let measured = measure(&args.scan, args.unit.into(), nominal.as_ref()).map_err(anyhow::Error::msg)?;
     if args.json {
         say(&serde_json::to_string(&measured)?);
     } else {
-        scan.notes.iter().for_each(|note| say(&format!("note: {note}")));
         say(&table(&measured));
     }
     Ok(Outcome::Done)

@@ -40,9 +40,9 @@ impl Materials {
         Materials::parse(&Document::new("config/materials.toml (built in)", SHIPPED))
     }
 
-    /// Reads a materials file.
-    pub fn load(path: &Path) -> Result<Materials, ConfigError> {
-        Materials::parse(&Document::read(path)?)
+    /// Reads a materials file; without one, those that come with the program.
+    pub fn load(path: Option<&Path>) -> Result<Materials, ConfigError> {
+        path.map_or_else(Materials::shipped, |path| Materials::parse(&Document::read(path)?))
     }
 
     /// Validates a materials text.

@@ -98,14 +98,12 @@ pub struct Inspection {
     pub notes: Vec<String>,
 }
 
-/// A diameter that is off by more than this share is another tube's: mill tolerances are below one in a hundred.
-const OTHER_TUBE_SHARE: f64 = 0.05;
-
 /// Says so when the tube measured is not of the part's diameter.
 pub fn other_diameter(measured: &MeasuredTube, nominal: &Nominal) -> Option<String> {
     let (found, wanted) = (2.0 * measured.tube_radius_mm, nominal.od_mm);
-    let other = (found - wanted).abs() > OTHER_TUBE_SHARE * wanted;
-    other.then(|| format!("the tube's diameter is {found:.2} mm, the part's is {wanted} mm"))
+    nominal
+        .is_other_tube(measured.tube_radius_mm)
+        .then(|| format!("the tube's diameter is {found:.2} mm, the part's is {wanted} mm"))
 }
 
 /// Inspects one measured tube. Rows of angle 0 in the nominal are merged first: no scan shows them.

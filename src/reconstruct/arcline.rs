@@ -5,7 +5,7 @@
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 
 use super::apollonius::{Chain, solve};
-use crate::tube::{Bend, Frame, Lra};
+use crate::tube::{Bend, Frame, Lra, any_normal};
 
 /// What an arc may be.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -147,11 +147,6 @@ fn lay_out(first: Point3<f64>, second: Point3<f64>, last: Point3<f64>, arcs: &[A
     }
     lra.last_length_mm = (last - at).dot(&tangent).max(0.0);
     (lra, Frame::from_parts(first.into(), turn))
-}
-
-fn any_normal(direction: &Vector3<f64>) -> Vector3<f64> {
-    let other = if direction.z.abs() < 0.9 { Vector3::z() } else { Vector3::y() };
-    direction.cross(&other).normalize()
 }
 
 #[cfg(test)]

@@ -9,9 +9,6 @@ use crate::tube::{Frame, Nominal, Spine};
 /// Places along the tube that are compared.
 const PLACES: usize = 100;
 
-/// A radius that is off by more than this share is another tube's.
-const OTHER_TUBE_SHARE: f64 = 0.05;
-
 /// The reconstruction in the direction in which it lies closer to the nominal.
 pub fn as_nominal(found: Reconstruction, nominal: &Nominal) -> Reconstruction {
     let wanted = places(&Spine::from_lra(&nominal.lra, Frame::identity()));
@@ -32,7 +29,7 @@ fn doubts(found: &Reconstruction, nominal: &Nominal) -> Vec<String> {
         doubts.push(format!("{bends} bends found, the nominal has {wanted}: is this the part?"));
     }
     let (radius, wanted) = (found.measured.tube_radius_mm, nominal.od_mm / 2.0);
-    if (radius - wanted).abs() > OTHER_TUBE_SHARE * wanted {
+    if nominal.is_other_tube(radius) {
         doubts.push(format!(
             "tube radius {radius:.2} mm, the nominal's is {wanted} mm: is this the part, in this unit?"
         ));

@@ -20,7 +20,7 @@ pub use lra::{Bend, Lra, TubeError, wrap_angle};
 pub use material::Material;
 pub use measured::{MeasuredBend, MeasuredTube};
 pub use nominal::{Alignment, Nominal, Tolerance};
-pub use polygon::{ControlPolygon, Corner};
+pub use polygon::{ControlPolygon, Corner, any_normal};
 pub use spine::{ClosestPoint, Frame, Segment, SegmentKind, Spine, StraightPoints};
 pub use table::{CommandRow, CommandTable};
 pub use ybc::{Ybc, YbcRow};

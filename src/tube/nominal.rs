@@ -54,3 +54,13 @@ pub struct Nominal {
     /// What is accepted.
     pub tolerance: Tolerance,
 }
+
+/// A diameter that is off by more than this share is another tube's: mill tolerances are below one in a hundred.
+const OTHER_TUBE_SHARE: f64 = 0.05;
+
+impl Nominal {
+    /// Whether a tube of this radius cannot be the part, whatever its shape.
+    pub fn is_other_tube(&self, tube_radius_mm: f64) -> bool {
+        (2.0 * tube_radius_mm - self.od_mm).abs() > OTHER_TUBE_SHARE * self.od_mm
+    }
+}

@@ -124,7 +124,7 @@ impl ControlPolygon {
 }
 
 /// Some unit vector across `direction`, always the same one.
-fn any_normal(direction: &Vector3<f64>) -> Vector3<f64> {
+pub fn any_normal(direction: &Vector3<f64>) -> Vector3<f64> {
     let axis = if direction.z.abs() < 0.9 { Vector3::z() } else { Vector3::y() };
     direction.cross(&axis).normalize()
 }
