@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::model::{Parameter, TubeModel};
 use super::moments::{Pass, Sample};
+use super::normal::equations;
 
 /// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
 const CUTOFF_SIGMAS: f64 = 6.0;
@@ -21,6 +22,8 @@ pub enum Stop {
     Stalled,
     /// The given number of iterations was used up.
     Iterations,
+    /// The goal is out of reach.
+    Hopeless,
 }
 
 /// A fitted tube.
@@ -44,6 +47,18 @@ pub struct Fit {
     pub passes: usize,
     /// Why it stopped.
     pub stop: Stop,
+}
+
+/// What a tube can be fitted to.
+pub trait Data {
+    /// Cost and moments of the model; residuals beyond `cutoff_mm` do not count.
+    fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass;
+}
+
+impl Data for Sample {
+    fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
+        Sample::pass(self, model, cutoff_mm)
+    }
 }
 
 /// How far to go.
@@ -74,7 +89,8 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
     let parameters = start.parameters();
     let mut cutoff = effort.cutoff_mm;
     let mut passes = 0;
-    let mut state = descend(sample, start.clone(), &parameters, cutoff, &effort);
+    let way = |cutoff_mm| Way { cutoff_mm, noise_mm: cutoff_mm / CUTOFF_SIGMAS, steps: effort.steps, goal: f64::INFINITY };
+    let mut state = descend(sample, start.clone(), &parameters, effort.prior, way(cutoff));
     passes += state.passes;
     for _ in 0..effort.rounds {
         let sigma = robust_sigma(&sample.residuals(&state.model), cutoff);
@@ -83,11 +99,11 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
             break;
         }
         cutoff = next;
-        state = descend(sample, state.model, &parameters, cutoff, &effort);
+        state = descend(sample, state.model, &parameters, effort.prior, way(cutoff));
         passes += state.passes;
     }
     let sigma_mm = robust_sigma(&sample.residuals(&state.model), cutoff);
-    let (normal, _) = state.pass.normal_equations(&state.model.motions(&parameters), &parameters);
+    let (normal, _) = equations(&state.pass.moments, &state.model, &parameters);
     let covariance = invert(&normal) * state.pass.variance_mm2(parameters.len());
     Fit {
         cost: state.pass.cost,
@@ -113,39 +129,55 @@ fn robust_sigma(residuals: &[f64], cutoff_mm: f64) -> f64 {
     (*median * MEDIAN_TO_SIGMA).max(1e-6)
 }
 
-struct Descent {
-    model: TubeModel,
-    pass: Pass,
-    passes: usize,
-    stop: Stop,
+/// Where a descent ended.
+#[derive(Debug, Clone)]
+pub struct Descent {
+    /// The model reached.
+    pub model: TubeModel,
+    /// The data's sums there.
+    pub pass: Pass,
+    /// Passes over the data.
+    pub passes: usize,
+    /// Why it stopped.
+    pub stop: Stop,
 }
 
-fn descend(
-    sample: &mut Sample,
+/// One descent's limits.
+#[derive(Debug, Clone, Copy)]
+pub struct Way {
+    /// Residuals beyond this do not count.
+    pub cutoff_mm: f64,
+    /// Standard deviation of the data, by which expectations are weighed.
+    pub noise_mm: f64,
+    /// Most steps.
+    pub steps: usize,
+    /// A descent that is far from getting below this cost is given up.
+    pub goal: f64,
+}
+
+/// Steps after which a descent may be given up, and what it may still gain, in gains of its last step.
+const PATIENCE: usize = 2;
+const HOPE: f64 = 4.0;
+
+/// Levenberg-Marquardt from a starting model.
+pub fn descend(
+    data: &mut impl Data,
     start: TubeModel,
     parameters: &[Parameter],
-    cutoff: f64,
-    effort: &Effort,
+    prior: Option<RadiusPrior>,
+    way: Way,
 ) -> Descent {
-    let noise = cutoff / CUTOFF_SIGMAS;
     let total = |model: &TubeModel, pass: &Pass| {
-        let off =
-            expectations(model, parameters, &effort.prior).map(|(_, off, spread)| (off / spread).powi(2));
-        pass.cost + 0.5 * noise * noise * off.sum::<f64>()
+        let off = expectations(model, parameters, &prior).map(|(_, off, spread)| (off / spread).powi(2));
+        pass.cost + 0.5 * way.noise_mm * way.noise_mm * off.sum::<f64>()
     };
     let mut model = start;
-    let mut pass = sample.pass(&model, cutoff);
+    let mut pass = data.pass(&model, way.cutoff_mm);
     let mut cost = total(&model, &pass);
     let (mut passes, mut damping) = (1, 1e-4);
-    for _ in 0..effort.steps {
-        let (mut normal, mut gradient) = pass.normal_equations(&model.motions(parameters), parameters);
-        for (j, off, spread) in expectations(&model, parameters, &effort.prior) {
-            let weight = (noise / spread).powi(2);
-            normal[(j, j)] += weight;
-            gradient[j] += weight * off;
-        }
-        freeze_at_bounds(&model, parameters, &mut normal, &mut gradient);
-        let mut improved = false;
+    for taken in 0..way.steps {
+        let (normal, gradient) = full_equations(&model, &pass, parameters, &prior, way.noise_mm);
+        let mut gained = None;
         while damping < 1e8 {
             let Some(step) = damped_step(&normal, &gradient, damping) else {
                 damping *= 10.0;
@@ -156,26 +188,44 @@ fn descend(
                 return Descent { model, pass, passes, stop: Stop::Converged };
             }
             let next = model.stepped(parameters, &step);
-            let next_pass = sample.pass(&next, cutoff);
+            let next_pass = data.pass(&next, way.cutoff_mm);
             let next_cost = total(&next, &next_pass);
             passes += 1;
             if next_cost < cost {
-                let gain = (cost - next_cost) / cost;
+                gained = Some(cost - next_cost);
                 (model, pass, cost) = (next, next_pass, next_cost);
                 damping = (damping * 0.1).max(1e-9);
-                if gain < 1e-7 {
-                    return Descent { model, pass, passes, stop: Stop::Converged };
-                }
-                improved = true;
                 break;
             }
             damping *= 10.0;
         }
-        if !improved {
-            return Descent { model, pass, passes, stop: Stop::Stalled };
+        let Some(gain) = gained else { return Descent { model, pass, passes, stop: Stop::Stalled } };
+        if gain < 1e-7 * cost {
+            return Descent { model, pass, passes, stop: Stop::Converged };
+        }
+        if taken >= PATIENCE && cost - HOPE * gain > way.goal {
+            return Descent { model, pass, passes, stop: Stop::Hopeless };
         }
     }
     Descent { model, pass, passes, stop: Stop::Iterations }
+}
+
+/// Normal equations with what is expected, and without what stands at a bound.
+fn full_equations(
+    model: &TubeModel,
+    pass: &Pass,
+    parameters: &[Parameter],
+    prior: &Option<RadiusPrior>,
+    noise_mm: f64,
+) -> (DMatrix<f64>, DVector<f64>) {
+    let (mut normal, mut gradient) = equations(&pass.moments, model, parameters);
+    for (j, off, spread) in expectations(model, parameters, prior) {
+        let weight = (noise_mm / spread).powi(2);
+        normal[(j, j)] += weight;
+        gradient[j] += weight * off;
+    }
+    freeze_at_bounds(model, parameters, &mut normal, &mut gradient);
+    (normal, gradient)
 }
 
 /// Sections of bends are expected to be this oval at most, in tube radii.

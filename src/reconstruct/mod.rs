@@ -13,11 +13,15 @@ mod ends;
 mod error;
 mod evidence;
 pub mod fit;
+mod local;
 mod measure;
 pub mod mls;
 pub mod model;
 pub mod moments;
+mod moves;
+mod normal;
 pub mod radius;
+mod sections;
 pub mod simplify;
 pub mod structure;
 
@@ -28,6 +32,7 @@ use crate::cloud::PointCloud;
 use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
 use fit::{Effort, fit};
 use moments::Sample;
+use sections::CentreLine;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -79,23 +84,22 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         most: structure::MOST_BENDS,
     };
     let chosen = structure::choose(&polygon, &sample, radius_mm).ok_or_else(not_bent)?;
-    let model = chosen.fit.model;
-    if structure::is_free_form(&model.lra, radius_mm) {
+    let model = chosen.model;
+    if moves::is_free_form(&model.lra, radius_mm) {
         return Err(not_bent());
     }
     let mut all = Sample::new(cloud.iter().collect(), &model);
     let mut best = fit(
         &mut all,
         &model,
-        Effort { cutoff_mm: chosen.fit.cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior },
+        Effort { cutoff_mm: 6.0 * chosen.noise_mm, rounds: 2, steps: 20, prior: chosen.prior },
     );
     if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
         let bends = best.model.lra.bends.len();
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
-    // Sigmas by what the points say together, not by their number (see `evidence::correlation`).
-    let patch = best.model.tube_radius_mm;
-    best.covariance *= evidence::correlation(&all, &best.model, patch, best.cutoff_mm, best.sigma_mm);
+    // Sigmas by what the points say together, not by their number (see `CentreLine::correlation`).
+    best.covariance *= CentreLine::measure(&all.points, &best.model).correlation(&best.model);
     let mut measured = measure::measure(&mut best, &mut all);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();

@@ -4,8 +4,9 @@
 //! Representation after paper 000, section 5.3. The first straight's length shares its gauge with the pose and
 //! is therefore no parameter; nor is the last one's, which the surface does not know (see `ends`).
 
-use nalgebra::{DVector, Matrix6xX, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{DVector, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
+use super::moments::{OVALITY, OWN_RADIUS, TUBE_RADIUS};
 use crate::tube::{Frame, Lra, SegmentKind, Spine, wrap_angle};
 
 /// A tube in space.
@@ -45,15 +46,37 @@ pub enum Parameter {
     TubeRadius,
 }
 
-/// How a segment moves with the parameters: everything rigid as twists in the segment's own frame.
-#[derive(Debug, Clone)]
-pub struct SegmentMotion {
-    /// Column j: velocity and angular velocity of the segment when parameter j grows by one.
-    pub twists: Matrix6xX<f64>,
-    /// Parameter of the segment's own CLR, for arcs.
-    pub own_radius: Option<usize>,
-    /// Parameter of the segment's own ovality, for arcs.
-    pub own_ovality: Option<usize>,
+/// One way in which a parameter moves the tube's surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Motion {
+    /// Everything from segment `from` on moves rigidly, by this twist (velocity, angular velocity) in the start frame.
+    Twist {
+        /// First segment that moves.
+        from: usize,
+        /// The twist when the parameter grows by one.
+        twist: Vector6<f64>,
+    },
+    /// One arc changes by itself: a row of its moment.
+    Own {
+        /// The arc.
+        segment: usize,
+        /// Row of the moment.
+        row: usize,
+    },
+    /// All segments change alike: a row of every moment.
+    Everywhere {
+        /// Row of the moments.
+        row: usize,
+    },
+}
+
+/// A motion and whose it is. A parameter may have several, which add up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Column {
+    /// Index of the parameter.
+    pub parameter: usize,
+    /// What it does.
+    pub motion: Motion,
 }
 
 /// Ovality beyond this share of the radius is no bent tube's any more.
@@ -94,31 +117,14 @@ impl TubeModel {
         Spine::from_lra(&self.lra, self.start)
     }
 
-    /// Twists of every segment, in the order of the spine's segments (line, arc, ..., line).
-    pub fn motions(&self, parameters: &[Parameter]) -> Vec<SegmentMotion> {
+    /// How the parameters move the tube. The segments are the spine's: line, arc, ..., line.
+    pub fn columns(&self, parameters: &[Parameter]) -> Vec<Column> {
         // In the start frame: its axes carry the pose parameters.
         let spine = Spine::from_lra(&self.lra, Frame::identity());
-        let columns: Vec<Vec<(usize, Vector6<f64>)>> =
-            parameters.iter().map(|p| sources(p, &spine)).collect();
-        let segments = spine.segments().iter().enumerate();
-        segments
-            .map(|(k, segment)| {
-                let mut twists = Matrix6xX::zeros(parameters.len());
-                for (j, sources) in columns.iter().enumerate() {
-                    let twist: Vector6<f64> =
-                        sources.iter().filter(|(from, _)| *from <= k).map(|(_, t)| t).sum();
-                    twists.set_column(j, &in_frame(&twist, &segment.start));
-                }
-                let own = |p: &Parameter| match p {
-                    Parameter::BendRadius(i) => k == 2 * i + 1,
-                    Parameter::CommonRadius => k % 2 == 1,
-                    _ => false,
-                };
-                let own_ovality =
-                    parameters.iter().position(|p| matches!(p, Parameter::Ovality(i) if k == 2 * i + 1));
-                SegmentMotion { twists, own_radius: parameters.iter().position(own), own_ovality }
-            })
-            .collect()
+        let of = |(parameter, p): (usize, &Parameter)| {
+            motions(p, &spine).into_iter().map(move |motion| Column { parameter, motion })
+        };
+        parameters.iter().enumerate().flat_map(of).collect()
     }
 
     /// The model after a step, brought back into what a tube can be (lengths >= 0, angles 0 to 355 degrees, bend
@@ -161,44 +167,50 @@ impl TubeModel {
     }
 }
 
-/// Which segments (from the given index on) a parameter moves, and by which twist in the start frame.
-fn sources(parameter: &Parameter, spine: &Spine) -> Vec<(usize, Vector6<f64>)> {
+/// What one parameter does.
+fn motions(parameter: &Parameter, spine: &Spine) -> Vec<Motion> {
     let segments = spine.segments();
     let turn = |axis: Vector3<f64>, through: Point3<f64>| join(through.coords.cross(&axis), axis);
+    let twist = |from, twist| vec![Motion::Twist { from, twist }];
     match *parameter {
         Parameter::Pose(k) => {
-            let mut twist = Vector6::zeros();
-            twist[k] = 1.0;
-            vec![(0, twist)]
+            let mut axis = Vector6::zeros();
+            axis[k] = 1.0;
+            twist(0, axis)
         }
         Parameter::Length(i) => {
             let tangent = segments[2 * i].start.rotation * Vector3::x();
-            vec![(2 * i + 1, join(tangent, Vector3::zeros()))]
+            twist(2 * i + 1, join(tangent, Vector3::zeros()))
         }
         Parameter::Rotation(i) => {
             let line = &segments[2 * i];
-            vec![(2 * i, turn(line.start.rotation * Vector3::x(), line.start.translation.vector.into()))]
+            let through = line.start.translation.vector.into();
+            twist(2 * i, turn(line.start.rotation * Vector3::x(), through))
         }
         Parameter::Angle(i) => {
             let arc = &segments[2 * i + 1];
             let centre = arc.centre().unwrap_or_else(|| arc.start.translation.vector.into());
-            vec![(2 * i + 2, turn(arc.start.rotation * Vector3::z(), centre))]
+            twist(2 * i + 2, turn(arc.start.rotation * Vector3::z(), centre))
         }
-        Parameter::BendRadius(i) => vec![end_shift(spine, i)],
-        Parameter::CommonRadius => (0..segments.len() / 2).map(|i| end_shift(spine, i)).collect(),
-        Parameter::Ovality(_) | Parameter::TubeRadius => Vec::new(),
+        Parameter::BendRadius(i) => bend_radius(spine, i).into(),
+        Parameter::CommonRadius => (0..segments.len() / 2).flat_map(|i| bend_radius(spine, i)).collect(),
+        Parameter::Ovality(i) => vec![Motion::Own { segment: 2 * i + 1, row: OVALITY }],
+        Parameter::TubeRadius => vec![Motion::Everywhere { row: TUBE_RADIUS }],
     }
 }
 
-/// Shift of all that follows bend `i` when its CLR grows by one at fixed start and angle.
-fn end_shift(spine: &Spine, i: usize) -> (usize, Vector6<f64>) {
+/// A bend whose CLR grows by one at fixed start and angle: it changes by itself, and all that follows is shifted.
+fn bend_radius(spine: &Spine, i: usize) -> [Motion; 2] {
     let arc = &spine.segments()[2 * i + 1];
     let angle = match arc.kind {
         SegmentKind::Arc { angle_rad, .. } => angle_rad,
         SegmentKind::Line => 0.0,
     };
     let shift = arc.start.rotation * Vector3::new(angle.sin(), 1.0 - angle.cos(), 0.0);
-    (2 * i + 2, join(shift, Vector3::zeros()))
+    [
+        Motion::Own { segment: 2 * i + 1, row: OWN_RADIUS },
+        Motion::Twist { from: 2 * i + 2, twist: join(shift, Vector3::zeros()) },
+    ]
 }
 
 fn join(velocity: Vector3<f64>, angular: Vector3<f64>) -> Vector6<f64> {

@@ -8,11 +8,11 @@
 //!
 //! Sums run over chunks of fixed size and are added in order: the result does not depend on the threads.
 
-use nalgebra::{DMatrix, DVector, Isometry3, Point3, SMatrix};
+use nalgebra::{Point3, SMatrix};
 use rayon::prelude::*;
 
-use super::model::{Parameter, SegmentMotion, TubeModel};
-use crate::tube::SegmentKind;
+use super::local::{Arc, Local, prepare, settle};
+use super::model::TubeModel;
 
 /// Points per chunk of a sum.
 const CHUNK: usize = 4096;
@@ -20,25 +20,17 @@ const CHUNK: usize = 4096;
 /// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
 pub const ROWS: usize = 9;
 
+/// Places of the other derivatives and of the residual in a moment.
+pub const OWN_RADIUS: usize = 6;
+/// See [`OWN_RADIUS`].
+pub const OVALITY: usize = 7;
+/// See [`OWN_RADIUS`].
+pub const TUBE_RADIUS: usize = 8;
+/// See [`OWN_RADIUS`].
+pub const RESIDUAL: usize = 9;
+
 /// The derivatives and the residual, squared.
 pub type Moment = SMatrix<f64, 10, 10>;
-
-/// A section turns from round to oval over this many tube radii at both ends of a bend.
-const OVAL_RAMP_RADII: f64 = 1.0;
-
-/// A segment prepared for the pass.
-struct Local {
-    to_local: Isometry3<f64>,
-    length_mm: f64,
-    arc: Option<Arc>,
-}
-
-/// What makes an arc.
-struct Arc {
-    radius_mm: f64,
-    angle_rad: f64,
-    ovality_mm: f64,
-}
 
 /// What a point sees of its segment, in the segment's frame.
 #[derive(Debug, Clone, Copy)]
@@ -51,7 +43,8 @@ struct Sight {
 /// The sums of one pass.
 #[derive(Debug, Clone)]
 pub struct Pass {
-    moments: Vec<Moment>,
+    /// Per segment, lower triangles.
+    pub moments: Vec<Moment>,
     /// Robust cost (Tukey's biweight), in mm^2.
     pub cost: f64,
     /// Sum of weights.
@@ -61,17 +54,6 @@ pub struct Pass {
     psi_slope: f64,
     /// Points with weight above zero.
     pub used: usize,
-}
-
-/// The moment of one piece of a segment.
-#[derive(Debug, Clone)]
-pub struct Station {
-    /// The segment.
-    pub segment: usize,
-    /// Arc length at which the piece ends.
-    pub end_mm: f64,
-    /// Squared derivatives and residuals, lower triangle, in the segment's frame.
-    pub moment: Moment,
 }
 
 /// Points with the segment that each belongs to, kept from pass to pass.
@@ -88,21 +70,6 @@ impl Sample {
         let spine = model.spine();
         let segment = points.par_iter().map(|p| spine.closest(p).segment as u32).collect();
         Sample { points, segment }
-    }
-
-    /// The same points for another model of nearly the same tube: each looks for its segment from where it was.
-    pub fn follow(&self, from: &TubeModel, to: &TubeModel) -> Sample {
-        let (old, new) = (from.spine(), to.spine());
-        let locals = prepare(to);
-        let follow = |(p, segment): (&Point3<f64>, &u32)| {
-            let segment = &old.segments()[*segment as usize];
-            let at = segment.start_mm + segment.closest_along_mm(p);
-            let mut next = new.segments().partition_point(|s| s.start_mm + s.length_mm < at) as u32;
-            settle(p, &mut next, &locals);
-            next
-        };
-        let segment = self.points.par_iter().zip(&self.segment).map(follow).collect();
-        Sample { points: self.points.clone(), segment }
     }
 
     /// Signed distances of all points from the model's surface; also moves each point to its segment.
@@ -127,65 +94,29 @@ impl Sample {
     /// Sums residuals and their derivatives with the biweight of cut-off `cutoff_mm`.
     pub fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
         let locals = prepare(model);
-        self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, locals.len(), |segment, _| segment)
-    }
-
-    /// The same with every segment cut into stations of about the given length.
-    pub fn pass_by_station(&mut self, model: &TubeModel, cutoff_mm: f64, station_mm: f64) -> Vec<Station> {
-        let spine = model.spine();
-        let counts = spine.segments().iter().map(|s| (s.length_mm / station_mm).ceil().max(1.0) as usize);
-        let counts: Vec<usize> = counts.collect();
-        let first: Vec<usize> = counts
-            .iter()
-            .scan(0, |next, n| {
-                *next += n;
-                Some(*next - n)
-            })
-            .collect();
-        let total = counts.iter().sum();
-        let locals = prepare(model);
-        let pass = self.pass_by(&locals, model.tube_radius_mm, cutoff_mm, total, |k, p| {
-            let share = locals[k].along_mm(p) / locals[k].length_mm.max(1e-12);
-            first[k] + ((share * counts[k] as f64) as usize).min(counts[k] - 1)
-        });
-        let stations = spine.segments().iter().enumerate().flat_map(|(segment, s)| {
-            let n = counts[segment];
-            (0..n).map(move |i| (segment, s.start_mm + s.length_mm * (i + 1) as f64 / n as f64))
-        });
-        let with_moment = stations.zip(pass.moments);
-        with_moment.map(|((segment, end_mm), moment)| Station { segment, end_mm, moment }).collect()
-    }
-
-    fn pass_by(
-        &mut self,
-        locals: &[Local],
-        tube_radius_mm: f64,
-        cutoff_mm: f64,
-        bins: usize,
-        bin: impl Fn(usize, &Point3<f64>) -> usize + Sync,
-    ) -> Pass {
         let chunks: Vec<Pass> = self
             .points
             .par_chunks(CHUNK)
             .zip(self.segment.par_chunks_mut(CHUNK))
             .map(|(points, segments)| {
-                let mut pass = Pass::empty(bins);
+                let mut pass = Pass::empty(locals.len());
                 for (p, segment) in points.iter().zip(segments) {
-                    let local = settle(p, segment, locals);
+                    let local = settle(p, segment, &locals);
                     let k = *segment as usize;
-                    pass.add(bin(k, &local), &see(&local, &locals[k], tube_radius_mm), cutoff_mm);
+                    pass.add(k, &see(&local, &locals[k], model.tube_radius_mm), cutoff_mm);
                 }
                 pass
             })
             .collect();
-        let mut total = Pass::empty(bins);
+        let mut total = Pass::empty(locals.len());
         chunks.iter().for_each(|c| total.merge(c));
         total
     }
 }
 
 impl Pass {
-    fn empty(segments: usize) -> Pass {
+    /// No points yet.
+    pub fn empty(segments: usize) -> Pass {
         let moments = vec![Moment::zeros(); segments];
         Pass { moments, cost: 0.0, weight: 0.0, psi_squared: 0.0, psi_slope: 0.0, used: 0 }
     }
@@ -224,112 +155,12 @@ impl Pass {
         self.used += other.used;
     }
 
-    /// Normal matrix J^T W J and gradient J^T W r.
-    pub fn normal_equations(
-        &self,
-        motions: &[SegmentMotion],
-        parameters: &[Parameter],
-    ) -> (DMatrix<f64>, DVector<f64>) {
-        let n = parameters.len();
-        let (mut matrix, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
-        for (moment, motion) in self.moments.iter().zip(motions) {
-            let mut moment = *moment;
-            moment.fill_upper_triangle_with_lower_triangle();
-            let basis = motion.basis(parameters);
-            matrix += basis.transpose() * (moment.fixed_view::<ROWS, ROWS>(0, 0) * &basis);
-            gradient += basis.transpose() * moment.fixed_view::<ROWS, 1>(0, ROWS);
-        }
-        (matrix, gradient)
-    }
-
     /// Variance of one point's residual as the estimate feels it: times the inverse of the normal matrix it gives the
     /// covariance (asymptotics of an M-estimate, P. Huber 1981, section 7.6).
     pub fn variance_mm2(&self, parameters: usize) -> f64 {
         let n = self.used as f64;
         let freedom = n / (n - parameters as f64).max(1.0);
         freedom * self.psi_squared * self.weight / self.psi_slope.max(1e-12).powi(2)
-    }
-}
-
-impl SegmentMotion {
-    /// How the derivatives that a moment holds follow from the parameters.
-    pub fn basis(&self, parameters: &[Parameter]) -> DMatrix<f64> {
-        let mut basis = DMatrix::zeros(ROWS, parameters.len());
-        basis.rows_mut(0, 6).copy_from(&self.twists);
-        let radius = parameters.iter().position(|p| *p == Parameter::TubeRadius);
-        for (row, own) in [(6, self.own_radius), (7, self.own_ovality), (8, radius)] {
-            if let Some(column) = own {
-                basis[(row, column)] = 1.0;
-            }
-        }
-        basis
-    }
-}
-
-fn prepare(model: &TubeModel) -> Vec<Local> {
-    let spine = model.spine();
-    let local = |(k, s): (usize, &crate::tube::Segment)| Local {
-        to_local: s.start.inverse(),
-        length_mm: s.length_mm,
-        arc: match s.kind {
-            SegmentKind::Arc { radius_mm, angle_rad } => {
-                Some(Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] })
-            }
-            SegmentKind::Line => None,
-        },
-    };
-    spine.segments().iter().enumerate().map(local).collect()
-}
-
-/// Moves a point along the tube to the segment it faces; returns it in that segment's frame.
-fn settle(p: &Point3<f64>, segment: &mut u32, locals: &[Local]) -> Point3<f64> {
-    let last = locals.len() - 1;
-    let mut came_from = usize::MAX;
-    let mut k = (*segment as usize).min(last);
-    loop {
-        let local = locals[k].to_local * p;
-        let next = match locals[k].side(&local) {
-            -1 if k > 0 => k - 1,
-            1 if k < last => k + 1,
-            _ => k,
-        };
-        if next == k || next == came_from {
-            *segment = k as u32;
-            return local;
-        }
-        came_from = k;
-        k = next;
-    }
-}
-
-impl Local {
-    /// Distance along the segment of the point's foot, clamped to it.
-    fn along_mm(&self, p: &Point3<f64>) -> f64 {
-        match &self.arc {
-            None => p.x.clamp(0.0, self.length_mm),
-            Some(arc) => {
-                let turn = p.x.atan2(arc.radius_mm - p.y).rem_euclid(std::f64::consts::TAU);
-                (turn * arc.radius_mm).min(self.length_mm)
-            }
-        }
-    }
-
-    /// Before (-1), on (0) or after (1) the segment.
-    fn side(&self, p: &Point3<f64>) -> i32 {
-        match &self.arc {
-            None => i32::from(p.x > self.length_mm) - i32::from(p.x < 0.0),
-            Some(arc) => {
-                let angle = arc.angle_rad;
-                // Turn measured from the middle of the gap opposite to the arc, so that it wraps there.
-                let turn = p.x.atan2(arc.radius_mm - p.y);
-                let turn = if turn < (angle / 2.0 - std::f64::consts::PI) {
-                    turn + std::f64::consts::TAU
-                } else {
-                    turn
-                };
-                i32::from(turn > angle) - i32::from(turn < 0.0)
-            }
-        }
     }
 }
 
@@ -366,21 +197,12 @@ fn see_arc(p: &Point3<f64>, arc: &Arc, tube_radius_mm: f64) -> Sight {
     Sight { residual_mm: distance - tube_radius_mm - arc.ovality_mm * cos_two, row }
 }
 
-impl Arc {
-    /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
-    /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
-    /// speed of convergence.
-    fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
-        let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
-        (from_end / (OVAL_RAMP_RADII * tube_radius_mm)).clamp(0.0, 1.0)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::reconstruct::normal;
     use crate::tube::{Bend, Frame, Lra};
-    use nalgebra::Vector3;
+    use nalgebra::{DVector, Vector3};
     use proptest::prelude::*;
 
     fn model(common_radius: bool) -> TubeModel {
@@ -425,7 +247,7 @@ mod tests {
             let mut sample = Sample::new(vec![p], &model);
             let cutoff = 1e6;
             let pass = sample.pass(&model, cutoff);
-            let (_, gradient) = pass.normal_equations(&model.motions(&parameters), &parameters);
+            let (_, gradient) = normal::equations(&pass.moments, &model, &parameters);
             let distance = |m: &TubeModel| Sample::new(vec![p], m).residuals(m)[0];
             let r = distance(&model);
             prop_assume!(r.abs() > 1e-3);

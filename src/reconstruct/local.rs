@@ -1,0 +1,134 @@
+//! The segments of a model ready for many points: which one a point faces, and where along it.
+//!
+//! Under `moments` and `sections`, which both walk points along the tube.
+
+use nalgebra::{Isometry3, Point3, Vector2, Vector3};
+
+use super::model::TubeModel;
+use crate::tube::SegmentKind;
+
+/// A section turns from round to oval over this many tube radii at both ends of a bend.
+const OVAL_RAMP_RADII: f64 = 1.0;
+
+/// A segment prepared for the pass.
+pub struct Local {
+    pub to_local: Isometry3<f64>,
+    pub length_mm: f64,
+    pub arc: Option<Arc>,
+}
+
+/// What makes an arc.
+pub struct Arc {
+    pub radius_mm: f64,
+    pub angle_rad: f64,
+    pub ovality_mm: f64,
+}
+
+/// The segments of the model, line, arc, ..., line.
+pub fn prepare(model: &TubeModel) -> Vec<Local> {
+    let spine = model.spine();
+    let local = |(k, s): (usize, &crate::tube::Segment)| Local {
+        to_local: s.start.inverse(),
+        length_mm: s.length_mm,
+        arc: match s.kind {
+            SegmentKind::Arc { radius_mm, angle_rad } => {
+                Some(Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] })
+            }
+            SegmentKind::Line => None,
+        },
+    };
+    spine.segments().iter().enumerate().map(local).collect()
+}
+
+/// Moves a point along the tube to the segment it faces; returns it in that segment's frame.
+pub fn settle(p: &Point3<f64>, segment: &mut u32, locals: &[Local]) -> Point3<f64> {
+    let last = locals.len() - 1;
+    let mut came_from = usize::MAX;
+    let mut k = (*segment as usize).min(last);
+    loop {
+        let local = locals[k].to_local * p;
+        let next = match locals[k].side(&local) {
+            -1 if k > 0 => k - 1,
+            1 if k < last => k + 1,
+            _ => k,
+        };
+        if next == k || next == came_from {
+            *segment = k as u32;
+            return local;
+        }
+        came_from = k;
+        k = next;
+    }
+}
+
+impl Local {
+    /// Distance along the segment of the point's foot, clamped to it.
+    pub fn along_mm(&self, p: &Point3<f64>) -> f64 {
+        match &self.arc {
+            None => p.x.clamp(0.0, self.length_mm),
+            Some(arc) => {
+                let turn = p.x.atan2(arc.radius_mm - p.y).rem_euclid(std::f64::consts::TAU);
+                (turn * arc.radius_mm).min(self.length_mm)
+            }
+        }
+    }
+
+    /// Before (-1), on (0) or after (1) the segment.
+    pub fn side(&self, p: &Point3<f64>) -> i32 {
+        match &self.arc {
+            None => i32::from(p.x > self.length_mm) - i32::from(p.x < 0.0),
+            Some(arc) => {
+                let angle = arc.angle_rad;
+                // Turn measured from the middle of the gap opposite to the arc, so that it wraps there.
+                let turn = p.x.atan2(arc.radius_mm - p.y);
+                let turn = if turn < (angle / 2.0 - std::f64::consts::PI) {
+                    turn + std::f64::consts::TAU
+                } else {
+                    turn
+                };
+                i32::from(turn > angle) - i32::from(turn < 0.0)
+            }
+        }
+    }
+}
+
+impl Arc {
+    /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
+    /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
+    /// speed of convergence.
+    pub fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
+        let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
+        (from_end / (OVAL_RAMP_RADII * tube_radius_mm)).clamp(0.0, 1.0)
+    }
+}
+
+impl Local {
+    /// Place across the tube, in the frame that goes along the segment: towards the bend's centre, along its normal.
+    pub fn off_axis(&self, p: &Point3<f64>) -> Vector2<f64> {
+        match &self.arc {
+            None => Vector2::new(p.y, p.z),
+            Some(arc) => Vector2::new(arc.radius_mm - p.x.hypot(arc.radius_mm - p.y), p.z),
+        }
+    }
+
+    /// Distance along the segment, beyond its ends too.
+    pub fn unclamped_along_mm(&self, p: &Point3<f64>) -> f64 {
+        match &self.arc {
+            None => p.x,
+            Some(_) => self.along_mm(p),
+        }
+    }
+
+    /// The point of the axis that a point faces, and the tangent there.
+    pub fn foot(&self, p: &Point3<f64>) -> (Point3<f64>, Vector3<f64>) {
+        match &self.arc {
+            None => (Point3::new(p.x, 0.0, 0.0), Vector3::x()),
+            Some(arc) => {
+                let ring = p.x.hypot(arc.radius_mm - p.y).max(1e-12);
+                let (sin, cos) = (p.x / ring, (arc.radius_mm - p.y) / ring);
+                let r = arc.radius_mm;
+                (Point3::new(r * sin, r * (1.0 - cos), 0.0), Vector3::new(cos, sin, 0.0))
+            }
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! Changes of a tube's structure by one bend: one dropped, two merged into one, one split in two, one put in.
+//!
+//! Under `structure`, which fits every changed tube and keeps what the data supports.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::evidence::Joint;
+use super::model::TubeModel;
+use crate::tube::{Bend, Lra, Segment};
+
+/// Seamless joints in one plane from which on a table is no bent tube's.
+const FREE_FORM_JOINTS: usize = 4;
+
+/// Neighbouring bends this near to one plane are tried as one.
+const MERGE_RAD: f64 = 0.6;
+
+/// Pairs of bends tried as one per round.
+const PAIRS: usize = 4;
+
+/// A bend this much wider than the mean may be two.
+const WIDE: f64 = 1.3;
+
+/// Smallest first angle of a bend that is tried.
+const TRIAL_RAD: f64 = 0.01;
+
+/// Mean CLR weighted by angle: sharp bends know theirs best. None without bends.
+pub fn mean_radius_mm(model: &TubeModel) -> Option<f64> {
+    let weight: f64 = model.lra.bends.iter().map(|b| b.angle_rad).sum();
+    let sum: f64 = model.lra.bends.iter().map(|b| b.angle_rad * b.radius_mm).sum();
+    (weight > 0.0).then(|| sum / weight)
+}
+
+/// The tube with one CLR for all bends.
+pub fn with_common_radius(model: &TubeModel) -> TubeModel {
+    let mut out = TubeModel { common_radius: true, ..model.clone() };
+    if let Some(mean) = mean_radius_mm(model) {
+        out.lra.bends.iter_mut().for_each(|b| b.radius_mm = mean);
+    }
+    out
+}
+
+/// The tube with bend `i` pulled straight.
+pub fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
+    let mut out = model.clone();
+    let gone = out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
+    let length = gone.length_mm + gone.radius_mm * gone.angle_rad;
+    match out.lra.bends.get_mut(i) {
+        Some(next) => {
+            next.length_mm += length;
+            next.rotation_rad += gone.rotation_rad;
+        }
+        None => out.lra.last_length_mm += length,
+    }
+    turn_into_pose(&mut out);
+    out
+}
+
+/// The first row's rotation belongs into the pose.
+fn turn_into_pose(model: &mut TubeModel) {
+    if let Some(first) = model.lra.bends.first_mut() {
+        model.start *= UnitQuaternion::from_axis_angle(&Vector3::x_axis(), first.rotation_rad);
+        first.rotation_rad = 0.0;
+    }
+}
+
+/// Bends that are likeliest one with the bend before: hardly a straight and hardly a turn between.
+pub fn likeliest_pairs(model: &TubeModel) -> Vec<usize> {
+    let bends = &model.lra.bends;
+    let apart =
+        |i: &usize| bends[*i].length_mm / model.tube_radius_mm + bends[*i].rotation_rad.abs() / MERGE_RAD;
+    let mut pairs: Vec<usize> = (1..bends.len()).collect();
+    pairs.sort_by(|a, b| apart(a).total_cmp(&apart(b)));
+    pairs.truncate(PAIRS);
+    pairs
+}
+
+/// Whether the table is a curve of no straights cut into arcs: bend on bend in one plane, which a bender would bend as
+/// one. Fewer than [`FREE_FORM_JOINTS`] such joints may be a measurement's doubt about one bend.
+pub fn is_free_form(lra: &Lra, tube_radius_mm: f64) -> bool {
+    let seamless = |b: &&Bend| b.length_mm < 0.2 * tube_radius_mm && b.rotation_rad.abs() < 0.3;
+    let joints = lra.bends.iter().skip(1).filter(seamless).count();
+    joints >= FREE_FORM_JOINTS && 2 * joints >= lra.bends.len()
+}
+
+/// Bends `i - 1` and `i` as one, when they turn in about one plane the same way.
+pub fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
+    let (one, other) = (model.lra.bends[i - 1], model.lra.bends[i]);
+    let angle_rad = one.angle_rad + other.angle_rad;
+    let arcs = one.radius_mm * one.angle_rad + other.radius_mm * other.angle_rad;
+    if other.rotation_rad.abs() > MERGE_RAD || other.length_mm > 0.5 * arcs || angle_rad <= 0.0 {
+        return None;
+    }
+    let mut out = model.clone();
+    let radius_mm = (arcs + other.length_mm) / angle_rad;
+    out.lra.bends[i - 1] = Bend { angle_rad, radius_mm, ..one };
+    out.lra.bends.remove(i);
+    out.ovality_mm.remove(i);
+    if let Some(next) = out.lra.bends.get_mut(i) {
+        next.rotation_rad += other.rotation_rad;
+    }
+    Some(out)
+}
+
+/// The bends at (or just beside) a joint, each as two with a straight between.
+pub fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
+    let spine = model.spine();
+    let near = 1.5 * model.tube_radius_mm;
+    let arcs = spine.segments().iter().enumerate().filter(|(k, s)| {
+        let reach = s.start_mm - near..s.start_mm + s.length_mm + near;
+        k % 2 == 1 && s.length_mm > 0.0 && reach.contains(&joint.at_mm)
+    });
+    let apart = |(k, segment): (usize, &Segment)| {
+        let mut out = model.clone();
+        let share = ((joint.at_mm - segment.start_mm) / segment.length_mm).clamp(0.15, 0.85);
+        let whole = out.lra.bends[k / 2];
+        // At least a little apart, also where the bend itself is shorter than that.
+        let length_mm = joint.shift_mm.min(segment.length_mm).max(0.1 * model.tube_radius_mm);
+        out.lra.bends[k / 2].angle_rad *= share;
+        let angle_rad = whole.angle_rad * (1.0 - share);
+        let rotation_rad = joint.turn_rad.x.clamp(-0.5, 0.5);
+        out.lra.bends.insert(k / 2 + 1, Bend { length_mm, rotation_rad, angle_rad, ..whole });
+        out.ovality_mm.insert(k / 2, model.ovality_mm[k / 2]);
+        out
+    };
+    arcs.map(apart).collect()
+}
+
+/// A bend that is much wider than the others as two of the usual radius at its ends.
+pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
+    let whole = model.lra.bends[i];
+    let usual = mean_radius_mm(model)?;
+    if whole.radius_mm < WIDE * usual || whole.angle_rad <= 0.0 {
+        return None;
+    }
+    let mut out = model.clone();
+    let half = Bend { angle_rad: 0.5 * whole.angle_rad, radius_mm: usual, ..whole };
+    let between = (whole.radius_mm - usual) * whole.angle_rad;
+    out.lra.bends[i] = half;
+    out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
+    out.ovality_mm.insert(i, 0.0);
+    Some(out)
+}
+
+/// The tube with the shallow bend that a joint asks for. Where the joint lies on (or near the end of) an arc the
+/// straights beside it are tried.
+pub fn with_bend(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
+    let spine = model.spine();
+    let segments = spine.segments();
+    let near = 1.5 * model.tube_radius_mm;
+    let lines = segments.iter().enumerate().filter(|(k, s)| {
+        let (from, to) = (s.start_mm - near, s.start_mm + s.length_mm + near);
+        let beside = |arc: Option<&Segment>| {
+            arc.is_some_and(|a| (a.start_mm..=a.start_mm + a.length_mm).contains(&joint.at_mm))
+        };
+        let next_to = (*k > 0 && beside(segments.get(k - 1))) || beside(segments.get(k + 1));
+        k % 2 == 0 && ((from..=to).contains(&joint.at_mm) || next_to)
+    });
+    let place = |(k, segment): (usize, &Segment)| {
+        let along = (joint.at_mm - segment.start_mm).clamp(0.1 * segment.length_mm, 0.9 * segment.length_mm);
+        insert(model, k / 2, along, joint)
+    };
+    lines.map(place).collect()
+}
+
+/// Puts a bend into straight `row`, turning as the joint does.
+fn insert(model: &TubeModel, row: usize, along_mm: f64, joint: &Joint) -> TubeModel {
+    let mut out = model.clone();
+    let radius_mm = mean_radius_mm(model).unwrap_or(6.0 * model.tube_radius_mm);
+    let angle_rad = joint.turn_rad.yz().norm().clamp(TRIAL_RAD, 20.0 * TRIAL_RAD);
+    // The plane's normal (0, y, z) is the frame's z axis rolled about x.
+    let roll = (-joint.turn_rad.y).atan2(joint.turn_rad.z);
+    let before = out.lra.bends.get(row).map_or(0.0, |b| b.rotation_rad);
+    let half = 0.5 * radius_mm * angle_rad;
+    let bend =
+        Bend { length_mm: (along_mm - half).max(0.0), rotation_rad: before + roll, angle_rad, radius_mm };
+    match out.lra.bends.get_mut(row) {
+        Some(next) => {
+            next.length_mm = (next.length_mm - along_mm - half).max(0.0);
+            next.rotation_rad = -roll;
+        }
+        None => out.lra.last_length_mm = (out.lra.last_length_mm - along_mm - half).max(0.0),
+    }
+    out.lra.bends.insert(row, bend);
+    out.ovality_mm.insert(row, 0.0);
+    turn_into_pose(&mut out);
+    out
+}

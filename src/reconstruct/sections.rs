@@ -1,0 +1,387 @@
+//! The measured centre line: what the points of every short stretch say of the tube's section there.
+//!
+//! Between the points and the search for the structure. The points of a section determine at most five values: the
+//! radius, the centre's place across the tube and how oval the section is. A tube that lies within a fraction of its radius of the
+//! base line predicts these five, so a structure can be fitted and judged on the sections alone, without its points: a
+//! hundred times cheaper, and nothing is lost that a small change of the tube could show (the sums are sufficient
+//! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
+
+use nalgebra::{Cholesky, Matrix5, Point3, SMatrix, Vector3, Vector5};
+
+use super::fit::Data;
+use super::local::{Local, prepare, settle};
+use super::model::TubeModel;
+use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
+use super::radius::median;
+use crate::tube::{Spine, any_normal};
+
+/// Values of a section: radius, place along the first and second direction across, ovality along them and between.
+const VALUES: usize = 5;
+
+/// Weighted sums of the products of the values' derivatives and of the residual.
+type Sums = SMatrix<f64, 6, 6>;
+
+/// Length of a section in tube radii, and how many points it should hold.
+const SECTION_RADII: f64 = 0.5;
+const ENOUGH_POINTS: f64 = 15.0;
+/// Sections are no longer than this, however few the points.
+const LONGEST_RADII: f64 = 2.0;
+
+/// What is expected of the values before anything is measured, in tube radii.
+const SPREADS: [f64; VALUES] = [0.1, 0.3, 0.3, 0.03, 0.03];
+
+/// Points farther than this from the base tube do not count, in tube radii.
+const FIRST_CUTOFF: f64 = 0.4;
+/// Cut-off of the biweight about the section's own fit, in standard deviations.
+const CUTOFF_SIGMAS: f64 = 6.0;
+/// Median of |x| to standard deviation for normal errors.
+const MEDIAN_TO_SIGMA: f64 = 1.4826;
+
+/// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.
+const JUDGED_POINTS: f64 = 8.0;
+const MEDIAN_CHI2: f64 = 4.351;
+
+/// One short stretch of the tube.
+#[derive(Debug, Clone)]
+pub struct Section {
+    /// A point of the base line.
+    centre: Point3<f64>,
+    /// Unit directions across the base line there.
+    across: [Vector3<f64>; 2],
+    sums: Sums,
+    /// Weight of its points.
+    count: f64,
+    /// Least cost that any values reach.
+    least: f64,
+}
+
+/// Sections in order along the tube.
+#[derive(Debug, Clone)]
+pub struct CentreLine {
+    sections: Vec<Section>,
+    /// Radius of the base tube.
+    radius_mm: f64,
+    /// Standard deviation of a point about its section.
+    pub noise_mm: f64,
+    /// Weight of all points.
+    pub count: f64,
+}
+
+/// A point as its section sees it.
+#[derive(Debug, Clone, Copy)]
+struct Seen {
+    section: u32,
+    along_mm: f64,
+    cos: f64,
+    sin: f64,
+    residual_mm: f64,
+}
+
+impl Seen {
+    /// Derivatives of the section's values.
+    fn row(&self) -> Vector5<f64> {
+        let (c, s) = (self.cos, self.sin);
+        Vector5::new(1.0, c, s, c * c - s * s, 2.0 * s * c)
+    }
+}
+
+impl CentreLine {
+    /// A polygon taken as a measured centre line whose points are alike in every direction.
+    pub fn of_polygon(polygon: &[Point3<f64>], radius_mm: f64) -> CentreLine {
+        let last = polygon.len() - 1;
+        let section = |i: usize| {
+            let tangent = polygon[(i + 1).min(last)] - polygon[i.saturating_sub(1)];
+            let first = any_normal(&tangent);
+            let second = tangent.cross(&first).try_normalize(1e-12).unwrap_or(Vector3::z());
+            let mut sums = Sums::identity();
+            sums[(VALUES, VALUES)] = 0.0;
+            Section { centre: polygon[i], across: [first, second], sums, count: 1.0, least: 0.0 }
+        };
+        let sections: Vec<Section> = (0..polygon.len()).map(section).collect();
+        CentreLine { count: sections.len() as f64, sections, radius_mm, noise_mm: 0.01 * radius_mm }
+    }
+
+    /// Measures the sections of a tube that lies near `base`.
+    pub fn measure(points: &[Point3<f64>], base: &TubeModel) -> CentreLine {
+        let spine = base.spine();
+        let per_radius = points.len() as f64 * base.tube_radius_mm / spine.length_mm().max(1e-9);
+        let radii = (ENOUGH_POINTS / per_radius).clamp(SECTION_RADII, LONGEST_RADII);
+        let bins = Bins::new(&spine, radii * base.tube_radius_mm);
+        let seen = see(points, base, &bins);
+        let grouped = group(seen, bins.total());
+        let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
+        let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
+        let mut noise = 0.1 * cutoff;
+        for _ in 0..3 {
+            for (fit, seen) in fits.iter_mut().zip(&grouped) {
+                *fit = solve(&sums(seen, fit, cutoff), base.tube_radius_mm, noise);
+            }
+            noise = scatter(&grouped, &fits, cutoff).max(1e-6);
+            cutoff = (CUTOFF_SIGMAS * noise).min(cutoff);
+        }
+        let mut sections = Vec::new();
+        for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
+            let sums = sums(seen, fit, cutoff);
+            let count = sums[(0, 0)];
+            if count < 1.0 {
+                continue;
+            }
+            let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
+            let frame = spine.segments()[place].frame_at(along);
+            let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
+            let best = solve(&sums, base.tube_radius_mm, noise);
+            let least = cost(&sums, &best).max(0.0);
+            sections.push(Section { centre: frame.translation.vector.into(), across, sums, count, least });
+        }
+        let count = sections.iter().map(|s| s.count).sum();
+        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count }
+    }
+
+    /// By how much the sections scatter about the model, over what their points' noise explains: 1 for independent noise
+    /// about the right tube. A median, so that a local misfit does not count.
+    pub fn correlation(&self, model: &TubeModel) -> f64 {
+        let mut excess = Vec::new();
+        self.walk(model, |section, _, values, _| {
+            if section.count >= JUDGED_POINTS {
+                excess.push(cost(&section.sums, values) - section.least);
+            }
+        });
+        let usual = median(&mut excess).unwrap_or(0.0) / (self.noise_mm * self.noise_mm);
+        (usual / MEDIAN_CHI2).max(1.0)
+    }
+
+    /// Moments of every section with the segment that it faces, in order along the tube.
+    pub fn moments(&self, model: &TubeModel) -> Vec<(usize, Moment)> {
+        let mut out = Vec::with_capacity(self.sections.len());
+        self.walk(model, |section, segment, values, derivatives| {
+            out.push((segment, moment(&section.sums, values, derivatives)));
+        });
+        out
+    }
+
+    /// Where every section faces the model: arc length.
+    pub fn places_mm(&self, model: &TubeModel) -> Vec<f64> {
+        let spine = model.spine();
+        let locals = prepare(model);
+        let mut segment = 0;
+        let place = |section: &Section| {
+            let local = settle(&section.centre, &mut segment, &locals);
+            let k = segment as usize;
+            spine.segments()[k].start_mm + locals[k].along_mm(&local)
+        };
+        self.sections.iter().map(place).collect()
+    }
+
+    /// Visits every section with its segment, the values that the model predicts for it, and their derivatives.
+    fn walk(
+        &self,
+        model: &TubeModel,
+        mut visit: impl FnMut(&Section, usize, &Values, &SMatrix<f64, VALUES, ROWS>),
+    ) {
+        let locals = prepare(model);
+        let mut segment = 0;
+        for section in &self.sections {
+            let local = settle(&section.centre, &mut segment, &locals);
+            let k = segment as usize;
+            let (mut values, derivatives) = predict(section, &local, &locals[k], model.tube_radius_mm);
+            values[0] = model.tube_radius_mm - self.radius_mm;
+            visit(section, k, &values, &derivatives);
+        }
+    }
+}
+
+impl Data for CentreLine {
+    fn pass(&mut self, model: &TubeModel, _cutoff_mm: f64) -> Pass {
+        let mut pass = Pass::empty(2 * model.lra.bends.len() + 1);
+        self.walk(model, |section, segment, values, derivatives| {
+            let moment = moment(&section.sums, values, derivatives);
+            pass.cost += 0.5 * moment[(RESIDUAL, RESIDUAL)];
+            pass.moments[segment] += moment;
+        });
+        pass
+    }
+}
+
+/// Where the model's centre line passes a section (`local`: its centre in the frame of the segment it faces), and how that
+/// depends on the moment's rows.
+fn predict(
+    section: &Section,
+    local: &Point3<f64>,
+    segment: &Local,
+    radius_mm: f64,
+) -> (Values, SMatrix<f64, VALUES, ROWS>) {
+    let mut values = Values::zeros();
+    let mut derivatives = SMatrix::<f64, VALUES, ROWS>::zeros();
+    derivatives[(0, TUBE_RADIUS)] = 1.0;
+    let across = section.across.map(|a| segment.to_local.rotation * a);
+    let (foot, tangent) = segment.foot(local);
+    let off = foot - local;
+    for (k, direction) in across.iter().enumerate() {
+        values[1 + k] = off.dot(direction);
+        // A slide along the tube is no shift across it.
+        let direction = direction - tangent * direction.dot(&tangent);
+        let lever = foot.coords.cross(&direction);
+        for axis in 0..3 {
+            derivatives[(1 + k, axis)] = direction[axis];
+            derivatives[(1 + k, 3 + axis)] = lever[axis];
+        }
+    }
+    if let Some(arc) = &segment.arc {
+        let outward = Vector3::new(tangent.y, -tangent.x, 0.0);
+        let [c, s] = across.map(|a| a.dot(&outward));
+        // 1 - cos of the turn: the tangent's x is its cosine.
+        derivatives[(1, OWN_RADIUS)] = (1.0 - tangent.x) * c;
+        derivatives[(2, OWN_RADIUS)] = (1.0 - tangent.x) * s;
+        let ramp = arc.ramp(tangent.y.atan2(tangent.x).rem_euclid(std::f64::consts::TAU), radius_mm);
+        derivatives[(3, OVALITY)] = ramp * (c * c - s * s);
+        derivatives[(4, OVALITY)] = ramp * 2.0 * s * c;
+        values[3] = arc.ovality_mm * derivatives[(3, OVALITY)];
+        values[4] = arc.ovality_mm * derivatives[(4, OVALITY)];
+    }
+    (values, derivatives)
+}
+
+/// The five values of a section.
+type Values = Vector5<f64>;
+
+/// Cost of values: sum of the squared residuals that they leave.
+fn cost(sums: &Sums, values: &Values) -> f64 {
+    let square = sums.fixed_view::<VALUES, VALUES>(0, 0);
+    let mixed = sums.fixed_view::<VALUES, 1>(0, VALUES);
+    sums[(VALUES, VALUES)] - 2.0 * mixed.dot(values) + (square * values).dot(values)
+}
+
+/// The moment of a section at the values that a model predicts.
+fn moment(sums: &Sums, values: &Values, derivatives: &SMatrix<f64, VALUES, ROWS>) -> Moment {
+    let square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
+    let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
+    // The residual falls as the values grow.
+    let left = square * values - mixed;
+    let mut out = Moment::zeros();
+    out.fixed_view_mut::<ROWS, ROWS>(0, 0).copy_from(&(derivatives.transpose() * (square * derivatives)));
+    let gradient = derivatives.transpose() * left;
+    out.fixed_view_mut::<ROWS, 1>(0, RESIDUAL).copy_from(&gradient);
+    out.fixed_view_mut::<1, ROWS>(RESIDUAL, 0).copy_from(&gradient.transpose());
+    out[(RESIDUAL, RESIDUAL)] = cost(sums, values);
+    out
+}
+
+/// Sums of a section's points, weighted by the biweight about its own fit.
+fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
+    let mut sums = Sums::zeros();
+    for point in seen {
+        let row = point.row();
+        let t = (point.residual_mm - row.dot(fit)) / cutoff_mm;
+        let keep = 1.0 - t * t;
+        if keep > 0.0 {
+            let h = [row[0], row[1], row[2], row[3], row[4], point.residual_mm];
+            for column in 0..=VALUES {
+                let scaled = keep * keep * h[column];
+                for (k, value) in h.iter().enumerate().skip(column) {
+                    sums[(k, column)] += scaled * value;
+                }
+            }
+        }
+    }
+    sums.fill_upper_triangle_with_lower_triangle();
+    sums
+}
+
+/// The values that fit best, held by what is expected where the points do not tell.
+fn solve(sums: &Sums, radius_mm: f64, noise_mm: f64) -> Values {
+    let mut square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
+    for (k, spread) in SPREADS.iter().enumerate() {
+        square[(k, k)] += (noise_mm / (spread * radius_mm)).powi(2);
+    }
+    let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
+    Cholesky::new(square).map_or(Values::zeros(), |c| c.solve(&mixed))
+}
+
+/// Robust standard deviation of the points about their sections' fits.
+fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
+    let mut sizes = Vec::new();
+    let mut spent = 0.0;
+    for (seen, fit) in grouped.iter().zip(fits) {
+        let before = sizes.len();
+        let off = seen.iter().map(|s| (s.residual_mm - s.row().dot(fit)).abs());
+        sizes.extend(off.filter(|r| *r < cutoff_mm));
+        spent += ((sizes.len() - before) as f64 * 0.5).min(VALUES as f64);
+    }
+    let n = sizes.len() as f64;
+    let freedom = (n / (n - spent).max(1.0)).sqrt();
+    median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
+}
+
+/// All points near the base tube.
+fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
+    let locals = prepare(base);
+    let spine = base.spine();
+    let cutoff = FIRST_CUTOFF * base.tube_radius_mm;
+    let mut out = Vec::with_capacity(points.len());
+    let mut segment = 0;
+    for p in points {
+        let mut local = settle(p, &mut segment, &locals);
+        let mut off = locals[segment as usize].off_axis(&local);
+        if (off.norm() - base.tube_radius_mm).abs() > cutoff {
+            // The point before may have been on another leg.
+            segment = spine.closest(p).segment as u32;
+            local = settle(p, &mut segment, &locals);
+            off = locals[segment as usize].off_axis(&local);
+        }
+        let distance = off.norm();
+        let residual_mm = distance - base.tube_radius_mm;
+        if residual_mm.abs() < cutoff {
+            let k = segment as usize;
+            let along_mm = locals[k].unclamped_along_mm(&local);
+            let section = bins.of(k, along_mm);
+            out.push(Seen {
+                section,
+                along_mm,
+                cos: off.x / distance,
+                sin: off.y / distance,
+                residual_mm,
+            });
+        }
+    }
+    out
+}
+
+/// Points by their section.
+fn group(seen: Vec<Seen>, sections: usize) -> Vec<Vec<Seen>> {
+    let mut out = vec![Vec::new(); sections];
+    seen.into_iter().for_each(|s| out[s.section as usize].push(s));
+    out
+}
+
+/// How the segments are cut into sections.
+struct Bins {
+    /// First section of every segment and one past the last.
+    first: Vec<usize>,
+    lengths_mm: Vec<f64>,
+}
+
+impl Bins {
+    fn new(spine: &Spine, length_mm: f64) -> Bins {
+        let mut first = vec![0];
+        for segment in spine.segments() {
+            let count = (segment.length_mm / length_mm).ceil().max(1.0) as usize;
+            first.push(first[first.len() - 1] + count);
+        }
+        Bins { first, lengths_mm: spine.segments().iter().map(|s| s.length_mm).collect() }
+    }
+
+    fn total(&self) -> usize {
+        self.first[self.first.len() - 1]
+    }
+
+    fn of(&self, segment: usize, along_mm: f64) -> u32 {
+        let count = self.first[segment + 1] - self.first[segment];
+        let share = (along_mm / self.lengths_mm[segment].max(1e-12)).clamp(0.0, 1.0);
+        (self.first[segment] + ((share * count as f64) as usize).min(count - 1)) as u32
+    }
+
+    /// The segment of every section.
+    fn places(&self) -> impl Iterator<Item = usize> + '_ {
+        (0..self.lengths_mm.len()).flat_map(|k| (self.first[k]..self.first[k + 1]).map(move |_| k))
+    }
+}
