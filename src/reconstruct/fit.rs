@@ -8,7 +8,7 @@ use super::moments::{Pass, Sample};
 use super::normal::equations;
 
 /// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
-const CUTOFF_SIGMAS: f64 = 6.0;
+pub const CUTOFF_SIGMAS: f64 = 6.0;
 
 /// Median of |x| to standard deviation for normal errors.
 const MEDIAN_TO_SIGMA: f64 = 1.4826;

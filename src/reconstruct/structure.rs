@@ -7,8 +7,9 @@ use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
 use super::evidence::{Joint, Solved};
-use super::fit::{Descent, RadiusPrior, Way, descend};
+use super::fit::{CUTOFF_SIGMAS, Descent, Effort, RadiusPrior, Way, descend, fit};
 use super::model::{Parameter, TubeModel};
+use super::moments::Sample;
 use super::moves::{
     doubled, is_free_form, likeliest_pairs, mean_radius_mm, merged, split, with_bend, with_common_radius,
     without_bend,
@@ -104,7 +105,7 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
     }
     let common = jury.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
     let model = if common.score < best.score { common.model } else { best.model };
-    Some(Structure { model, noise_mm: jury.line.noise_mm, prior: jury.prior })
+    Some(jury.confirmed(sample, model))
 }
 
 /// The arc-line spline of the polygon at a tolerance.
@@ -187,6 +188,37 @@ impl Jury {
         let doubled = (0..n).filter_map(|i| doubled(model, i));
         let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled);
         all.filter(|m| m.lra.bends.len() <= MOST_BENDS).collect()
+    }
+
+    /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
+    /// points may have taken some that are not the tube's for its own.
+    fn confirmed(&self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
+        let mut sample = Sample::new(sample.to_vec(), &model);
+        let noise_mm = self.line.noise_mm;
+        let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
+        let effort = Effort { cutoff_mm, rounds: 0, steps: FULL_STEPS, prior: self.prior };
+        let mut fit_points = |model: &TubeModel| {
+            let found = fit(&mut sample, model, effort);
+            let misfit = 2.0 * found.cost / (noise_mm * noise_mm) / self.correlation;
+            let score = misfit + self.price(found.parameters.len());
+            (found, score)
+        };
+        let (mut best, mut score) = fit_points(&model);
+        loop {
+            let bends = &best.model.lra.bends;
+            let bearable = DOUBT * self.price(5);
+            let doubtful = |i: &usize| {
+                let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
+                at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * self.correlation * best.covariance[(j, j)])
+            };
+            let less: Vec<TubeModel> =
+                (0..bends.len()).filter(doubtful).map(|i| without_bend(&best.model, i)).collect();
+            let fits = less.iter().map(&mut fit_points);
+            match fits.min_by(|a, b| a.1.total_cmp(&b.1)) {
+                Some(better) if better.1 < score => (best, score) = better,
+                _ => return Structure { model: best.model, noise_mm, prior: self.prior },
+            }
+        }
     }
 
     /// Places where a joint would help, the most helpful first, no two close together.
