@@ -89,7 +89,12 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
     let parameters = start.parameters();
     let mut cutoff = effort.cutoff_mm;
     let mut passes = 0;
-    let way = |cutoff_mm| Way { cutoff_mm, noise_mm: cutoff_mm / CUTOFF_SIGMAS, steps: effort.steps, goal: f64::INFINITY };
+    let way = |cutoff_mm| Way {
+        cutoff_mm,
+        noise_mm: cutoff_mm / CUTOFF_SIGMAS,
+        steps: effort.steps,
+        goal: f64::INFINITY,
+    };
     let mut state = descend(sample, start.clone(), &parameters, effort.prior, way(cutoff));
     passes += state.passes;
     for _ in 0..effort.rounds {

@@ -92,13 +92,42 @@ impl Local {
     }
 }
 
+/// An oval section: an ellipse with half axes radius + oval towards the outside of the bend and radius - oval across.
+pub struct Oval {
+    /// The section's radius in a direction.
+    pub radius_mm: f64,
+    /// Its derivatives by the tube's radius, by the ovality, and by the direction.
+    pub by_radius: f64,
+    /// See `by_radius`.
+    pub by_oval: f64,
+    /// See `by_radius`.
+    pub by_direction_mm: f64,
+}
+
+impl Oval {
+    /// The section in the direction (cos, sin) from the outside of the bend.
+    pub fn at(cos: f64, sin: f64, radius_mm: f64, oval_mm: f64) -> Oval {
+        let (a, b) = (radius_mm + oval_mm, radius_mm - oval_mm);
+        let square = b * b * cos * cos + a * a * sin * sin;
+        let root = square.sqrt();
+        let cubic = a * b / (square * root);
+        Oval {
+            radius_mm: a * b / root,
+            by_radius: 2.0 * radius_mm / root - cubic * (b * cos * cos + a * sin * sin),
+            by_oval: -2.0 * oval_mm / root + cubic * (b * cos * cos - a * sin * sin),
+            by_direction_mm: -cubic * cos * sin * 4.0 * radius_mm * oval_mm,
+        }
+    }
+}
+
 impl Arc {
     /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
     /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
     /// speed of convergence.
     pub fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
         let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
-        (from_end / (OVAL_RAMP_RADII * tube_radius_mm)).clamp(0.0, 1.0)
+        let full = (OVAL_RAMP_RADII * tube_radius_mm).min(0.5 * self.angle_rad * self.radius_mm);
+        0.5 - 0.5 * (std::f64::consts::PI * (from_end / full.max(1e-12)).clamp(0.0, 1.0)).cos()
     }
 }
 

@@ -11,7 +11,7 @@
 use nalgebra::{Point3, SMatrix};
 use rayon::prelude::*;
 
-use super::local::{Arc, Local, prepare, settle};
+use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 
 /// Points per chunk of a sum.
@@ -176,8 +176,8 @@ fn see(p: &Point3<f64>, local: &Local, tube_radius_mm: f64) -> Sight {
     }
 }
 
-/// In the arc's frame, with section coordinates (outward, z) around the spine. The section's radius is the tube's plus
-/// e cos 2 psi; the residual's gradient is the section's radial direction less r'(psi) / rho times the tangential one.
+/// In the arc's frame, with section coordinates (outward, z) around the spine. The residual's gradient is the section's
+/// radial direction less r'(psi) / rho times the tangential one.
 fn see_arc(p: &Point3<f64>, arc: &Arc, tube_radius_mm: f64) -> Sight {
     let (qx, qy) = (p.x, p.y - arc.radius_mm);
     let ring = qx.hypot(qy).max(1e-12);
@@ -186,15 +186,17 @@ fn see_arc(p: &Point3<f64>, arc: &Arc, tube_radius_mm: f64) -> Sight {
     let distance = outward.hypot(p.z).max(1e-12);
     let (cos, sin) = (outward / distance, p.z / distance);
     let ramp = arc.ramp(ux.atan2(-uy).rem_euclid(std::f64::consts::TAU), tube_radius_mm);
-    let cos_two = ramp * (cos * cos - sin * sin);
-    let slope = -4.0 * arc.ovality_mm * ramp * sin * cos / distance;
+    let oval = Oval::at(cos, sin, tube_radius_mm, arc.ovality_mm * ramp);
+    let slope = oval.by_direction_mm / distance;
     // Along the section: outward and z components of the gradient.
     let (along_outward, along_z) = (cos + slope * sin, sin - slope * cos);
     let (mx, my, mz) = (along_outward * ux, along_outward * uy, along_z);
     let own = along_outward * (-uy - 1.0);
     let moment = [p.y * mz - p.z * my, p.z * mx - p.x * mz, p.x * my - p.y * mx];
-    let row = [-mx, -my, -mz, -moment[0], -moment[1], -moment[2], own, -cos_two, -1.0];
-    Sight { residual_mm: distance - tube_radius_mm - arc.ovality_mm * cos_two, row }
+    let turns = [-moment[0], -moment[1], -moment[2]];
+    let own = [own, -ramp * oval.by_oval, -oval.by_radius];
+    let row = [-mx, -my, -mz, turns[0], turns[1], turns[2], own[0], own[1], own[2]];
+    Sight { residual_mm: distance - oval.radius_mm, row }
 }
 
 #[cfg(test)]
@@ -223,7 +225,7 @@ mod tests {
                 last_length_mm: 50.0,
             },
             tube_radius_mm: 10.0,
-            ovality_mm: vec![0.0; 3],
+            ovality_mm: vec![-0.4, 0.3, -0.2],
             common_radius,
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! Under `structure`, which fits every changed tube and keeps what the data supports.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
 use super::evidence::Joint;
 use super::model::TubeModel;
@@ -13,6 +13,9 @@ const FREE_FORM_JOINTS: usize = 4;
 
 /// Neighbouring bends this near to one plane are tried as one.
 const MERGE_RAD: f64 = 0.6;
+
+/// Bends that turn less than this together are tried as one whatever their planes.
+const SHALLOW_RAD: f64 = 0.35;
 
 /// Pairs of bends tried as one per round.
 const PAIRS: usize = 4;
@@ -83,22 +86,43 @@ pub fn is_free_form(lra: &Lra, tube_radius_mm: f64) -> bool {
     joints >= FREE_FORM_JOINTS && 2 * joints >= lra.bends.len()
 }
 
-/// Bends `i - 1` and `i` as one, when they turn in about one plane the same way.
+/// Bends `i - 1` and `i` as one: an arc over both when they turn in about one plane the same way, or, shallow ones in any
+/// planes, their joint turn in between.
 pub fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
     let (one, other) = (model.lra.bends[i - 1], model.lra.bends[i]);
-    let angle_rad = one.angle_rad + other.angle_rad;
+    let sum_rad = one.angle_rad + other.angle_rad;
     let arcs = one.radius_mm * one.angle_rad + other.radius_mm * other.angle_rad;
-    if other.rotation_rad.abs() > MERGE_RAD || other.length_mm > 0.5 * arcs || angle_rad <= 0.0 {
+    let whole = arcs + other.length_mm;
+    let (sin, cos) = other.rotation_rad.sin_cos();
+    let across = Vector2::new(one.angle_rad + other.angle_rad * cos, other.angle_rad * sin);
+    let (before, bend, roll) = if other.rotation_rad.abs() <= MERGE_RAD && other.length_mm <= 0.5 * arcs {
+        (0.0, Bend { angle_rad: sum_rad, radius_mm: whole / sum_rad.max(1e-9), ..one }, 0.0)
+    } else if sum_rad < SHALLOW_RAD {
+        let angle_rad = across.norm().max(TRIAL_RAD);
+        let radius_mm = (arcs / sum_rad.max(1e-9)).min(whole / angle_rad);
+        let share = (other.angle_rad / sum_rad.max(1e-9)).clamp(0.0, 1.0);
+        let before = share * (whole - radius_mm * angle_rad);
+        (before, Bend { angle_rad, radius_mm, ..one }, across.y.atan2(across.x))
+    } else {
+        return None;
+    };
+    if sum_rad <= 0.0 {
         return None;
     }
     let mut out = model.clone();
-    let radius_mm = (arcs + other.length_mm) / angle_rad;
-    out.lra.bends[i - 1] = Bend { angle_rad, radius_mm, ..one };
+    let rest = whole - bend.radius_mm * bend.angle_rad - before;
+    let (length_mm, rotation_rad) = (one.length_mm + before, one.rotation_rad + roll);
+    out.lra.bends[i - 1] = Bend { length_mm, rotation_rad, ..bend };
     out.lra.bends.remove(i);
     out.ovality_mm.remove(i);
-    if let Some(next) = out.lra.bends.get_mut(i) {
-        next.rotation_rad += other.rotation_rad;
+    match out.lra.bends.get_mut(i) {
+        Some(next) => {
+            next.rotation_rad += other.rotation_rad - roll;
+            next.length_mm += rest;
+        }
+        None => out.lra.last_length_mm += rest,
     }
+    turn_into_pose(&mut out);
     Some(out)
 }
 

@@ -83,7 +83,11 @@ pub fn equations(
         }
         (Motion::Twist { from, twist }, Motion::Own { segment, row })
         | (Motion::Own { segment, row }, Motion::Twist { from, twist }) => {
-            if from <= segment { twist.dot(&parts[segment].against(row)) } else { 0.0 }
+            if from <= segment {
+                twist.dot(&parts[segment].against(row))
+            } else {
+                0.0
+            }
         }
         (Motion::Twist { from, twist }, Motion::Everywhere { row })
         | (Motion::Everywhere { row }, Motion::Twist { from, twist }) => {

@@ -9,7 +9,7 @@
 use nalgebra::{Cholesky, Matrix5, Point3, SMatrix, Vector3, Vector5};
 
 use super::fit::Data;
-use super::local::{Local, prepare, settle};
+use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
 use super::radius::median;
@@ -28,14 +28,25 @@ const ENOUGH_POINTS: f64 = 15.0;
 const LONGEST_RADII: f64 = 2.0;
 
 /// What is expected of the values before anything is measured, in tube radii.
-const SPREADS: [f64; VALUES] = [0.1, 0.3, 0.3, 0.03, 0.03];
+const SPREADS: [f64; VALUES] = [0.01, 0.3, 0.3, 0.02, 0.02];
 
 /// Points farther than this from the base tube do not count, in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
+/// Rounds in which the cut-off comes down to the noise, no faster than by this factor.
+const SHRINKS: usize = 6;
+const SHRINK: f64 = 0.4;
+/// Noise over cut-off that is pretended while points are weighed.
+const FIRMNESS: f64 = 0.3;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 /// Median of |x| to standard deviation for normal errors.
 const MEDIAN_TO_SIGMA: f64 = 1.4826;
+
+/// How far a section's ovality may differ from the model's, in tube radii; beside the tangent points, where it grows in
+/// some way or other, also this share of the bend's; and how far beside.
+const OVAL_DOUBT: f64 = 1e-5;
+const OVAL_DOUBT_SHARE: f64 = 0.15;
+const OVAL_DOUBT_RADII: f64 = 1.2;
 
 /// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.
 const JUDGED_POINTS: f64 = 8.0;
@@ -49,6 +60,8 @@ pub struct Section {
     /// Unit directions across the base line there.
     across: [Vector3<f64>; 2],
     sums: Sums,
+    /// The base tube's ovality, about which the sums are taken.
+    oval_mm: [f64; 2],
     /// Weight of its points.
     count: f64,
     /// Least cost that any values reach.
@@ -95,7 +108,14 @@ impl CentreLine {
             let second = tangent.cross(&first).try_normalize(1e-12).unwrap_or(Vector3::z());
             let mut sums = Sums::identity();
             sums[(VALUES, VALUES)] = 0.0;
-            Section { centre: polygon[i], across: [first, second], sums, count: 1.0, least: 0.0 }
+            Section {
+                centre: polygon[i],
+                across: [first, second],
+                sums,
+                oval_mm: [0.0; 2],
+                count: 1.0,
+                least: 0.0,
+            }
         };
         let sections: Vec<Section> = (0..polygon.len()).map(section).collect();
         CentreLine { count: sections.len() as f64, sections, radius_mm, noise_mm: 0.01 * radius_mm }
@@ -112,26 +132,38 @@ impl CentreLine {
         let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
-        for _ in 0..3 {
+        for _ in 0..SHRINKS {
             for (fit, seen) in fits.iter_mut().zip(&grouped) {
-                *fit = solve(&sums(seen, fit, cutoff), base.tube_radius_mm, noise);
+                // Weighing, a section must not swing after a flying point where it sees nothing else: held more firmly
+                // than the noise asks for.
+                *fit = solve(&sums(seen, fit, cutoff), base.tube_radius_mm, FIRMNESS * cutoff);
             }
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
-            cutoff = (CUTOFF_SIGMAS * noise).min(cutoff);
+            cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
         let mut sections = Vec::new();
         for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
-            let sums = sums(seen, fit, cutoff);
+            let mut sums = sums(seen, fit, cutoff);
             let count = sums[(0, 0)];
             if count < 1.0 {
                 continue;
             }
             let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
-            let frame = spine.segments()[place].frame_at(along);
+            let segment = &spine.segments()[place];
+            let frame = segment.frame_at(along);
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
+            let oval_mm = [oval(base, place, along), 0.0];
+            doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, segment.start_mm + along));
             let best = solve(&sums, base.tube_radius_mm, noise);
             let least = cost(&sums, &best).max(0.0);
-            sections.push(Section { centre: frame.translation.vector.into(), across, sums, count, least });
+            sections.push(Section {
+                centre: frame.translation.vector.into(),
+                across,
+                sums,
+                oval_mm,
+                count,
+                least,
+            });
         }
         let count = sections.iter().map(|s| s.count).sum();
         CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count }
@@ -185,6 +217,8 @@ impl CentreLine {
             let k = segment as usize;
             let (mut values, derivatives) = predict(section, &local, &locals[k], model.tube_radius_mm);
             values[0] = model.tube_radius_mm - self.radius_mm;
+            values[3] -= section.oval_mm[0];
+            values[4] -= section.oval_mm[1];
             visit(section, k, &values, &derivatives);
         }
     }
@@ -312,6 +346,42 @@ fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
 }
 
+/// Lets the section's ovality differ from the model's by as much as `stiffness` (noise over spread) allows: the sums with
+/// that difference eliminated.
+fn doubt_ovality(sums: &mut Sums, stiffness: f64) {
+    let free: SMatrix<f64, 2, 2> =
+        sums.fixed_view::<2, 2>(3, 3) + SMatrix::identity() * (stiffness * stiffness);
+    let rows: SMatrix<f64, 2, 6> = sums.fixed_view::<2, 6>(3, 0).into_owned();
+    if let Some(inverse) = free.try_inverse() {
+        *sums -= rows.transpose() * (inverse * rows);
+    }
+}
+
+/// Spread of a section's ovality about the model's at a place of the base tube.
+fn oval_doubt_mm(base: &TubeModel, spine: &Spine, at_mm: f64) -> f64 {
+    let radius = base.tube_radius_mm;
+    let beside = |(i, e): (usize, &f64)| {
+        let arc = &spine.segments()[2 * i + 1];
+        let near = |tangent_mm: f64| (at_mm - tangent_mm).abs() < OVAL_DOUBT_RADII * radius;
+        let doubtful = near(arc.start_mm) || near(arc.start_mm + arc.length_mm);
+        if doubtful { OVAL_DOUBT_SHARE * e.abs() } else { 0.0 }
+    };
+    let most = base.ovality_mm.iter().enumerate().map(beside).fold(0.0, f64::max);
+    most.hypot(OVAL_DOUBT * radius)
+}
+
+/// Ovality of the base tube at a place of a segment, from the outside of its bend.
+fn oval(base: &TubeModel, segment: usize, along_mm: f64) -> f64 {
+    match base.lra.bends.get(segment / 2).filter(|_| segment % 2 == 1) {
+        Some(bend) => {
+            let e = base.ovality_mm[segment / 2];
+            let arc = Arc { radius_mm: bend.radius_mm, angle_rad: bend.angle_rad, ovality_mm: e };
+            e * arc.ramp(along_mm / bend.radius_mm, base.tube_radius_mm)
+        }
+        None => 0.0,
+    }
+}
+
 /// All points near the base tube.
 fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
     let locals = prepare(base);
@@ -329,18 +399,14 @@ fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
             off = locals[segment as usize].off_axis(&local);
         }
         let distance = off.norm();
-        let residual_mm = distance - base.tube_radius_mm;
-        if residual_mm.abs() < cutoff {
+        if (distance - base.tube_radius_mm).abs() < cutoff {
             let k = segment as usize;
             let along_mm = locals[k].unclamped_along_mm(&local);
+            let (cos, sin) = (off.x / distance, off.y / distance);
+            let round = Oval::at(cos, sin, base.tube_radius_mm, oval(base, k, along_mm));
+            let residual_mm = distance - round.radius_mm;
             let section = bins.of(k, along_mm);
-            out.push(Seen {
-                section,
-                along_mm,
-                cos: off.x / distance,
-                sin: off.y / distance,
-                residual_mm,
-            });
+            out.push(Seen { section, along_mm, cos, sin, residual_mm });
         }
     }
     out

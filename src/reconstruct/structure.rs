@@ -79,9 +79,9 @@ struct Jury {
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -> Option<Structure> {
-    let mut jury =
-        Jury { line: CentreLine::of_polygon(polygon, radius_mm), correlation: 1.0, prior: None };
-    let starts: Vec<TubeModel> = TOLERANCES.iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
+    let mut jury = Jury { line: CentreLine::of_polygon(polygon, radius_mm), correlation: 1.0, prior: None };
+    let starts: Vec<TubeModel> =
+        TOLERANCES.iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
     let rough: Vec<Candidate> = starts.iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
     let first = rough.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.line = CentreLine::measure(sample, &first.model);
@@ -90,7 +90,8 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
     let clearest = fitted.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&clearest.model);
     jury.correlation = jury.line.correlation(&clearest.model);
-    let mut best = fitted.iter().map(|c| jury.judge(c.model.clone())).min_by(|a, b| a.score.total_cmp(&b.score))?;
+    let mut best =
+        fitted.iter().map(|c| jury.judge(c.model.clone())).min_by(|a, b| a.score.total_cmp(&b.score))?;
     for _ in 0..MEASUREMENTS {
         jury.line = CentreLine::measure(sample, &best.model);
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
@@ -104,8 +105,11 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
         }
     }
     let common = jury.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
-    let model = if common.score < best.score { common.model } else { best.model };
-    Some(jury.confirmed(sample, model))
+    if common.score < best.score {
+        // With one radius neighbours may turn out to be one bend.
+        best = jury.search(common);
+    }
+    Some(jury.confirmed(sample, best.model))
 }
 
 /// The arc-line spline of the polygon at a tolerance.
@@ -209,7 +213,9 @@ impl Jury {
             let bearable = DOUBT * self.price(5);
             let doubtful = |i: &usize| {
                 let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
-                at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * self.correlation * best.covariance[(j, j)])
+                at.is_some_and(|j| {
+                    bends[*i].angle_rad.powi(2) < bearable * self.correlation * best.covariance[(j, j)]
+                })
             };
             let less: Vec<TubeModel> =
                 (0..bends.len()).filter(doubtful).map(|i| without_bend(&best.model, i)).collect();
