@@ -4,12 +4,14 @@
 //! millimetres that downstream rooms may trust (finite, no duplicates, an extent that a tube can have).
 
 mod door;
+mod duplicates;
 mod error;
 mod format;
 mod neighbours;
 mod ply;
 mod point_cloud;
 mod raw;
+mod stream;
 #[cfg(test)]
 mod tests;
 mod text;
