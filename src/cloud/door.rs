@@ -12,7 +12,7 @@ use super::duplicates::repeated;
 use super::format::{Format, detect};
 use super::raw::{Bounds, Coordinate, Points, Raw};
 use super::stream::{BLOCK, Source};
-use super::{CloudError, PointCloud, Unit, ply, text};
+use super::{CloudError, PointCloud, Unit, e57, ply, stl, text};
 
 /// Fewest points that can be a scan of a tube.
 const FEWEST_POINTS: usize = 100;
@@ -84,42 +84,44 @@ pub(super) fn scan(
 fn whole(format: Format, file: &str, bytes: &[u8]) -> Result<Raw, CloudError> {
     match format {
         Format::Ply => ply::read(file, bytes),
+        Format::E57 => e57::read(file, bytes),
+        Format::Stl => stl::read(file, bytes),
         Format::Text => text::read(file, bytes),
     }
 }
 
 /// The checks that hold for every format.
-fn admit(file: &str, raw: Raw, unit: Unit) -> Result<(PointCloud, Vec<String>), CloudError> {
-    let Raw { points, mut normals, mut notes, corners } = raw;
-    let mut cloud = match points {
-        Points::Single(points) => admit_points(file, points, &mut normals, unit, corners, &mut notes)?,
-        Points::Double(points) => admit_points(file, points, &mut normals, unit, corners, &mut notes)?,
+fn admit(file: &str, mut raw: Raw, unit: Unit) -> Result<(PointCloud, Vec<String>), CloudError> {
+    let mut cloud = match std::mem::take(&mut raw.points) {
+        Points::Single(points) => admit_points(file, points, &mut raw, unit)?,
+        Points::Double(points) => admit_points(file, points, &mut raw, unit)?,
     };
-    cloud.normals = normals.and_then(|n| unit_normals(n, &mut notes));
-    Ok((cloud, notes))
+    cloud.normals = raw.normals.and_then(|n| unit_normals(n, &mut raw.notes));
+    Ok((cloud, raw.notes))
 }
 
+/// The same for points of either precision; `raw` has the rest.
 fn admit_points<T: Coordinate>(
     file: &str,
     mut points: Vec<[T; 3]>,
-    normals: &mut Option<Vec<[f32; 3]>>,
+    raw: &mut Raw,
     unit: Unit,
-    corners: bool,
-    notes: &mut Vec<String>,
 ) -> Result<PointCloud, CloudError> {
     let few = |found| CloudError::TooFew { file: file.to_owned(), found, allowed: FEWEST_POINTS };
-    let scale = unit.millimetres();
     let bounds = Bounds::of(&points).ok_or_else(|| few(0))?;
     check_finite(file, &points, bounds.finite)?;
-    let [min, max] = [bounds.min, bounds.max].map(|c| Point3::from(c.map(|v| v.into() * scale + 0.0)));
+    let [min, max] = [bounds.min, bounds.max].map(|c| Point3::from(c.map(|v| v.into() + 0.0)));
+    let unit = raw.unit.map_or(unit, |own| own.or_given(unit, (max - min).norm(), &mut raw.notes));
+    let scale = unit.millimetres();
+    let [min, max] = [min * scale, max * scale];
     check_magnitude(file, &points, scale, min.coords.amax().max(max.coords.amax()))?;
     let repeated = repeated(&points);
     if !repeated.is_empty() {
-        if !corners {
-            notes.push(format!("{} duplicate points removed", repeated.len()));
+        if !raw.corners {
+            raw.notes.push(format!("{} duplicate points removed", repeated.len()));
         }
         remove(&mut points, &repeated);
-        normals.iter_mut().for_each(|n| remove(n, &repeated));
+        raw.normals.iter_mut().for_each(|n| remove(n, &repeated));
     }
     if points.len() < FEWEST_POINTS {
         return Err(few(points.len()));

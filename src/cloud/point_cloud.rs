@@ -4,8 +4,9 @@
 //! system's origin loses nothing.
 
 use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
 
-use super::raw::{Bounds, Coordinate};
+use super::raw::{Bounds, Coordinate, TASK};
 
 /// Points in millimetres, with unit normals where the scanner gave them. All coordinates are finite (the
 /// readers refuse others).
@@ -98,6 +99,17 @@ impl PointCloud {
     pub fn select(&self, indices: &[usize]) -> PointCloud {
         let normals = self.normals.as_ref().map(|n| indices.iter().map(|&i| n[i]).collect());
         PointCloud::from_offsets(self.origin, indices.iter().map(|&i| self.offsets[i]).collect(), normals)
+    }
+
+    /// The same with indices as the cloud's own passes have them.
+    pub(super) fn pick(&self, indices: &[u32]) -> PointCloud {
+        let chosen = |all: &[[f32; 3]]| -> Vec<[f32; 3]> {
+            if indices.len() <= TASK {
+                return indices.iter().map(|&i| all[i as usize]).collect();
+            }
+            indices.par_iter().with_min_len(TASK).map(|&i| all[i as usize]).collect()
+        };
+        PointCloud::from_offsets(self.origin, chosen(&self.offsets), self.normals.as_deref().map(chosen))
     }
 
     /// Offset of point `i` from the origin.

@@ -4,6 +4,8 @@ use std::ops::{Add, AddAssign, Sub};
 
 use rayon::prelude::*;
 
+use super::Unit;
+
 /// A coordinate as a file holds it.
 pub(super) trait Coordinate:
     Copy + Default + PartialOrd + Add<Output = Self> + Sub<Output = Self> + AddAssign + Into<f64> + Send + Sync
@@ -44,6 +46,12 @@ pub(super) enum Points {
     Double(Vec<[f64; 3]>),
 }
 
+impl Default for Points {
+    fn default() -> Points {
+        Points::Single(Vec::new())
+    }
+}
+
 /// What a reader hands to the door: points in the file's unit, normals where the file has them.
 #[derive(Debug)]
 pub(super) struct Raw {
@@ -52,12 +60,14 @@ pub(super) struct Raw {
     pub notes: Vec<String>,
     /// Corners of facets: a point is there as often as facets meet in it, which is no fault.
     pub corners: bool,
+    /// The unit that the format prescribes.
+    pub unit: Option<Unit>,
 }
 
 impl Raw {
     /// Points without normals.
     pub fn new(points: Points) -> Raw {
-        Raw { points, normals: None, notes: Vec::new(), corners: false }
+        Raw { points, normals: None, notes: Vec::new(), corners: false, unit: None }
     }
 }
 
