@@ -5,6 +5,9 @@ use nalgebra::{Point3, Vector3};
 use super::PointCloud;
 use super::cells::{Cells, Numbers, key};
 
+/// Points looked at together.
+const CHUNK: usize = 32;
+
 /// A cloud's points sorted into cubes; answers indices into that cloud.
 ///
 /// Fastest when the cells' edge is about the radius that will be asked for; any other works too.
@@ -61,12 +64,8 @@ impl Grid {
         let limit = radius_mm * radius_mm;
         let mut visit = |cell: u32| {
             let cell = cell as usize;
-            for (offset, index) in &self.points[self.starts[cell] as usize..self.starts[cell + 1] as usize] {
-                let way = Vector3::from(*offset).cast::<f64>() - at;
-                if way.x * way.x + way.y * way.y + way.z * way.z <= limit {
-                    each(*index, way);
-                }
-            }
+            let points = &self.points[self.starts[cell] as usize..self.starts[cell + 1] as usize];
+            points.chunks(CHUNK).for_each(|chunk| among(chunk, &at, limit, &mut each));
         };
         // A hair more, so that rounding cannot leave out the cell of a point just at the radius.
         let reach = radius_mm * (1.0 + 1e-9) + 1e-6 * cells.edge_mm() + 1e-15 * at.amax();
@@ -87,6 +86,21 @@ impl Grid {
                 }
             }
         }
+    }
+}
+
+/// Collects first and calls after: whether a point is near is a guess that a processor gets wrong too often.
+fn among(chunk: &[([f32; 3], u32)], at: &Vector3<f64>, limit: f64, each: &mut impl FnMut(u32, Vector3<f64>)) {
+    let way = |offset: &[f32; 3]| Vector3::from(*offset).cast::<f64>() - at;
+    let (mut near, mut count) = ([0u8; CHUNK], 0);
+    for (i, (offset, _)) in (0..).zip(chunk) {
+        let way = way(offset);
+        near[count] = i;
+        count += usize::from(way.x * way.x + way.y * way.y + way.z * way.z <= limit);
+    }
+    for &i in &near[..count] {
+        let (offset, index) = &chunk[usize::from(i)];
+        each(*index, way(offset));
     }
 }
 
