@@ -121,7 +121,7 @@ mod tests {
     #[test]
     fn many_tasks_many_copies_and_nothing_but_copies() {
         let points: Vec<[f64; 3]> =
-            (0..200_000).map(|i| [f64::from(i % 150_001), f64::from(i % 7 % 1), 0.25]).collect();
+            (0..200_000).map(|i| [f64::from(i % 150_001), f64::from(i % 3), 0.25]).collect();
         assert_eq!(repeated(&points), brute(&points));
         assert_eq!(repeated(&vec![[1.0f32; 3]; 100_000]), (1..100_000).collect::<Vec<_>>());
     }

@@ -71,9 +71,14 @@ impl Grid {
         let reach = radius_mm * (1.0 + 1e-9) + 1e-6 * cells.edge_mm() + 1e-15 * at.amax();
         let low = cells.at(at.add_scalar(-reach).into());
         let high = cells.at(at.add_scalar(reach).into());
-        let [xs, ys, zs] = [0, 1, 2].map(|i| low[i]..=high[i].min(self.last[i]));
-        let size = |r: &std::ops::RangeInclusive<u32>| r.clone().count() as u64;
-        if size(&xs) * size(&ys) * size(&zs) > self.occupied.keys.len() as u64 {
+        let [xs, ys, zs] = [0, 1, 2].map(|i| low[i]..high[i].min(self.last[i]) + 1);
+        let size = |r: &std::ops::Range<u32>| u64::from(r.end.saturating_sub(r.start));
+        let count = size(&xs) * size(&ys) * size(&zs);
+        // Beside the cloud; not left to the loops, two of which may be long.
+        if count == 0 {
+            return;
+        }
+        if count > self.occupied.keys.len() as u64 {
             (0..self.occupied.keys.len() as u32).for_each(visit);
             return;
         }

@@ -1,6 +1,6 @@
 //! What stands between the readers and the door: a file's content before it is judged.
 
-use std::ops::{Add, AddAssign, Sub};
+use std::ops::{AddAssign, Mul};
 
 use rayon::prelude::*;
 
@@ -8,7 +8,7 @@ use super::Unit;
 
 /// A coordinate as a file holds it.
 pub(super) trait Coordinate:
-    Copy + Default + PartialOrd + Add<Output = Self> + Sub<Output = Self> + AddAssign + Into<f64> + Send + Sync
+    Copy + Default + PartialOrd + Mul<Output = Self> + AddAssign + Into<f64> + Send + Sync
 {
     /// Its bits, equal for equal numbers (0 and -0 are).
     fn bits(self) -> u64;
@@ -97,20 +97,20 @@ impl<T: Coordinate> Bounds<T> {
         let first = *points.first()?;
         let mut low: [T; 12] = std::array::from_fn(|i| first[i % 3]);
         let mut high = low;
-        // A number less itself is 0, or NaN when it is not finite: NaN stays in a sum.
+        // A number times 0 is 0, or NaN when it is not finite: NaN stays in a sum.
         let mut strange = [T::default(); 12];
         let (fours, rest) = points.as_chunks::<4>();
         for four in fours {
             for (i, &v) in four.as_flattened().iter().enumerate() {
                 low[i] = if v < low[i] { v } else { low[i] };
                 high[i] = if v > high[i] { v } else { high[i] };
-                strange[i] += v - v;
+                strange[i] += v * T::default();
             }
         }
         for (i, &v) in rest.as_flattened().iter().enumerate() {
             low[i] = if v < low[i] { v } else { low[i] };
             high[i] = if v > high[i] { v } else { high[i] };
-            strange[i] += v - v;
+            strange[i] += v * T::default();
         }
         let lane = |from: &[T; 12], k: usize| std::array::from_fn(|i| from[3 * k + i]);
         let finite = strange.iter().all(|&s| s == T::default());
