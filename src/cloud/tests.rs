@@ -779,8 +779,11 @@ fn an_e57_that_lies_or_is_cut_or_is_none() {
     says(&refusal("s.e57", &more), &["s.e57"]);
     // Values of no bits: a file of a kilobyte could claim any number of points.
     let nothing = e57(&good(), |xml| {
-        let empty = "type=\"Integer\" minimum=\"0\" maximum=\"0\"";
-        xml.replace("type=\"Float\"", empty).replace("maximum=\"2\"", "maximum=\"0\"")
+        let empty = |xml: String, axis: &str| {
+            let double = format!("<cartesian{axis} type=\"Float\"");
+            xml.replace(&double, &format!("<cartesian{axis} type=\"Integer\" minimum=\"0\" maximum=\"0\""))
+        };
+        ["X", "Y", "Z"].into_iter().fold(xml, empty).replace("maximum=\"2\"", "maximum=\"0\"")
     });
     says(&refusal("s.e57", &nothing), &["no point that differs"]);
     says(&refusal("s.e57", &e57(&[], |xml| xml)), &["0 points"]);
