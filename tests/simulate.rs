@@ -33,7 +33,7 @@ fn unusable_arguments_end_with_status_2_and_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.ply");
     for (out, more, reason) in [
-        (folder.path().join("a.stl"), &[][..], "only .ply, .xyz, .asc and .txt are written"),
+        (folder.path().join("a.step"), &[][..], "only .ply, .e57, .stl"),
         (folder.path().join("no/such/a.ply"), &[], "cannot be written"),
         (file.clone(), &["--noise-mm=-1"], "allowed is 0 to 10"),
         (file.clone(), &["--outliers", "nan"], "allowed is 0 to 1"),

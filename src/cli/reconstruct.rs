@@ -10,7 +10,7 @@ use crate::tube::MeasuredTube;
 /// Arguments of `benderd reconstruct`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The scan: PLY, XYZ, ASC, PTS or CSV.
+    /// The scan: PLY, E57, STL, XYZ, ASC, PTS or CSV.
     scan: PathBuf,
     /// The part that the scan should show; its direction of travel is used.
     #[arg(long, value_name = "PART")]

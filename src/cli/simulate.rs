@@ -33,7 +33,7 @@ struct ScanArgs {
     /// Same seed, same scan.
     #[arg(long)]
     seed: u64,
-    /// The scan file to write: .ply, or text as .xyz, .asc or .txt.
+    /// The scan file to write: .ply, .e57, .stl, or text as .xyz, .asc, .txt, .pts or .csv.
     #[arg(long)]
     out: PathBuf,
     /// About this many points on the tube.

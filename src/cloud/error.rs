@@ -22,7 +22,7 @@ pub enum CloudError {
         reason: std::io::Error,
     },
     /// Not a format that is read (or written).
-    #[error("{file}: {found}; scans are .ply, or text as .xyz .asc .pts .csv .txt")]
+    #[error("{file}: {found}; scans are .ply, .e57, .stl, or text as .xyz .asc .pts .csv .txt")]
     Format {
         /// Path as given.
         file: String,
@@ -70,6 +70,16 @@ pub enum CloudError {
         found: String,
         /// What may stand there.
         allowed: String,
+    },
+    /// An E57 file that breaks its format.
+    #[error(
+        "{file}: not a sound E57 file: {reason}; was the export or the copy interrupted? Export the scan again"
+    )]
+    E57 {
+        /// Path as given.
+        file: String,
+        /// What the reader found.
+        reason: String,
     },
     /// Fewer points than the file announces.
     #[error(

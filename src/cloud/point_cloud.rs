@@ -4,6 +4,9 @@
 //! system's origin loses nothing.
 
 use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
+
+use super::raw::{Bounds, Coordinate, TASK};
 
 /// Points in millimetres, with unit normals where the scanner gave them. All coordinates are finite (the
 /// readers refuse others).
@@ -12,6 +15,8 @@ pub struct PointCloud {
     pub(super) origin: Point3<f64>,
     pub(super) offsets: Vec<[f32; 3]>,
     pub(super) normals: Option<Vec<[f32; 3]>>,
+    /// Smallest and largest offsets; None without points.
+    extent: Option<Bounds<f32>>,
 }
 
 impl PointCloud {
@@ -23,7 +28,23 @@ impl PointCloud {
     /// A cloud without normals about a given origin.
     pub(super) fn around(origin: Point3<f64>, points: &[Point3<f64>]) -> PointCloud {
         let offsets = points.iter().map(|p| (p - origin).map(|v| v as f32).into()).collect();
-        PointCloud { origin, offsets, normals: None }
+        PointCloud::from_offsets(origin, offsets, None)
+    }
+
+    /// A cloud about an origin out of coordinates in another unit.
+    pub(super) fn scaled<T: Coordinate>(origin: Point3<f64>, points: Vec<[T; 3]>, scale: f64) -> PointCloud {
+        // Adding 0 turns -0 into 0, so that equal coordinates are equal bits.
+        let offset = |p: [T; 3]| std::array::from_fn(|i| (p[i].into() * scale + 0.0 - origin[i]) as f32);
+        PointCloud::from_offsets(origin, T::offsets(points, offset), None)
+    }
+
+    pub(super) fn from_offsets(
+        origin: Point3<f64>,
+        offsets: Vec<[f32; 3]>,
+        normals: Option<Vec<[f32; 3]>>,
+    ) -> PointCloud {
+        let extent = Bounds::of(&offsets);
+        PointCloud { origin, offsets, normals, extent }
     }
 
     /// The same cloud with one normal per point. None when the numbers differ.
@@ -57,19 +78,38 @@ impl PointCloud {
         self.normals.as_ref().map(|n| Vector3::from(n[i]).cast())
     }
 
-    /// Smallest and largest coordinates; None for an empty cloud.
+    /// Smallest and largest coordinates; None for an empty cloud. Known since the cloud was made.
     pub fn bounds(&self) -> Option<(Point3<f64>, Point3<f64>)> {
         let (min, max) = self.offset_bounds()?;
         Some((self.origin + min.cast(), self.origin + max.cast()))
     }
 
+    /// Where the offsets begin, in millimetres.
+    pub fn origin(&self) -> Point3<f64> {
+        self.origin
+    }
+
+    /// All points as offsets from the origin in millimetres, for passes that vectorise: `origin() + offset` is
+    /// the point, and differences of offsets are differences of points.
+    pub fn offsets(&self) -> &[[f32; 3]] {
+        &self.offsets
+    }
+
     /// The points at `indices`, in that order, with their normals.
     pub fn select(&self, indices: &[usize]) -> PointCloud {
-        PointCloud {
-            origin: self.origin,
-            offsets: indices.iter().map(|&i| self.offsets[i]).collect(),
-            normals: self.normals.as_ref().map(|n| indices.iter().map(|&i| n[i]).collect()),
-        }
+        let normals = self.normals.as_ref().map(|n| indices.iter().map(|&i| n[i]).collect());
+        PointCloud::from_offsets(self.origin, indices.iter().map(|&i| self.offsets[i]).collect(), normals)
+    }
+
+    /// The same with indices as the cloud's own passes have them.
+    pub(super) fn pick(&self, indices: &[u32]) -> PointCloud {
+        let chosen = |all: &[[f32; 3]]| -> Vec<[f32; 3]> {
+            if indices.len() <= TASK {
+                return indices.iter().map(|&i| all[i as usize]).collect();
+            }
+            indices.par_iter().with_min_len(TASK).map(|&i| all[i as usize]).collect()
+        };
+        PointCloud::from_offsets(self.origin, chosen(&self.offsets), self.normals.as_deref().map(chosen))
     }
 
     /// Offset of point `i` from the origin.
@@ -79,11 +119,7 @@ impl PointCloud {
 
     /// Bounds of the offsets.
     pub(super) fn offset_bounds(&self) -> Option<(Vector3<f32>, Vector3<f32>)> {
-        let first = Vector3::from(*self.offsets.first()?);
-        Some(self.offsets.iter().fold((first, first), |(min, max), o| {
-            let o = Vector3::from(*o);
-            (min.inf(&o), max.sup(&o))
-        }))
+        self.extent.map(|b| (b.min.into(), b.max.into()))
     }
 }
 

@@ -535,3 +535,280 @@ fn a_real_scan_in_metres() {
 fn notes_removed(notes: &[String]) -> usize {
     notes.iter().filter_map(|n| n.strip_suffix(" duplicate points removed")?.parse::<usize>().ok()).sum()
 }
+
+// ---- streams ----------------------------------------------------------------------------------------------
+
+/// Gives its bytes in dribs, as a pipe does, and says nothing of their number.
+struct Drips<'a>(&'a [u8], usize);
+
+impl std::io::Read for Drips<'_> {
+    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
+        let n = out.len().min(self.1).min(self.0.len());
+        out[..n].copy_from_slice(&self.0[..n]);
+        self.0 = &self.0[n..];
+        Ok(n)
+    }
+}
+
+/// More points than the head of a file holds, so that blocks follow.
+fn long() -> Vec<u8> {
+    let points: Vec<_> =
+        (0..200_000).map(|i| Point3::new(f64::from(i % 1000), f64::from(i / 1000), 0.5)).collect();
+    let mut file = header("binary_little_endian", "200000").into_bytes();
+    file.extend(floats(&points));
+    file
+}
+
+#[test]
+fn blocks_of_any_size_and_pipes_read_alike() {
+    let file = long();
+    let whole = accepted("s.ply", &file);
+    assert_eq!((whole.cloud.len(), whole.notes.len()), (200_000, 0));
+    for (block, drip, size) in
+        [(1000, 64, 0), (4096, 4096, 0), (65_537, 1000, 7), (1 << 20, 1 << 16, u64::MAX / 4)]
+    {
+        let source = stream::Source::new("s.ply", Drips(&file, drip), size, 1 << 30);
+        let scan = door::scan(Path::new("s.ply"), source, block, Unit::Millimetre).unwrap();
+        assert!(scan == whole, "blocks of {block}, {drip} bytes at a time");
+    }
+}
+
+#[test]
+fn a_stream_that_ends_early_or_grows_or_never_ends() {
+    let file = long();
+    let read = |bytes: &[u8], size: u64, most: u64| {
+        let source = stream::Source::new("s.ply", bytes, size, most);
+        door::scan(Path::new("s.ply"), source, 1 << 16, Unit::Millimetre)
+    };
+    let all = file.len() as u64;
+    // Truncated between the look at its size and the reading, within a record.
+    let short = read(&file[..file.len() - 25], all, 1 << 30).unwrap_err().to_string();
+    says(&short, &["200000 vertices announced", "199997 found"]);
+    let mut grown = file.clone();
+    grown.extend([7; 300_000]);
+    let scan = read(&grown, all, 1 << 30).unwrap();
+    assert_eq!(scan.notes, ["300000 bytes after the last vertex passed over"]);
+    assert_eq!(scan.cloud, accepted("s.ply", &file).cloud);
+    says(&read(&grown, all, all).unwrap_err().to_string(), &["at most"]);
+    says(&read(&file, 0, 1000).unwrap_err().to_string(), &["at most 1000 are read"]);
+    assert!(read(&file, all, all).is_ok());
+}
+
+#[test]
+fn long_texts_keep_order_and_line_numbers() {
+    let points: Vec<_> =
+        (0..60_000).map(|i| Point3::new(f64::from(i % 300), f64::from(i / 300), 0.25)).collect();
+    let rows = text(&points, " ").replace("\n7 ", "\n\n# seven\n7 ");
+    let scan = accepted("s.xyz", rows.as_bytes());
+    assert_eq!(error_mm(&scan.cloud, &points), 0.0);
+    // Two faults: the first is named, wherever the pieces are cut.
+    for line in [1, 20_000, 59_999] {
+        let mut lines: Vec<&str> = rows.lines().collect();
+        lines[line] = "1 2 x3";
+        lines[60_001] = "1 2 x3";
+        let bad = lines.join("\n");
+        says(&refusal("s.xyz", bad.as_bytes()), &[&format!("line {}, column 5", line + 1)]);
+    }
+    let ply = header("ascii", "60000") + &text(&points, " ");
+    assert_eq!(error_mm(&accepted("s.ply", ply.as_bytes()).cloud, &points), 0.0);
+    let bad = ply.replacen("\n150 150 ", "\n150 1s0 ", 1);
+    says(&refusal("s.ply", bad.as_bytes()), &["line 45158, column 5"]);
+}
+
+#[test]
+fn more_than_the_head_without_end_of_header() {
+    let mut file = b"ply\ncomment ".to_vec();
+    file.extend(vec![b'a'; 3 << 20]);
+    says(&refusal("s.ply", &file), &["end_header"]);
+}
+
+// ---- written and read -------------------------------------------------------------------------------------
+
+#[test]
+fn every_format_that_is_written_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let cloud = PointCloud::from_points(&sample());
+    let read = |name: &str| read_scan(&folder.path().join(name), Unit::Millimetre).unwrap();
+    for name in ["a.ply", "a.e57", "a.stl", "a.xyz", "a.asc", "a.txt", "a.pts", "a.csv"] {
+        write_scan(&folder.path().join(name), &cloud).unwrap();
+        let scan = read(name);
+        assert!(error_mm(&scan.cloud, &sample()) < 5e-5, "{name}");
+        assert!(scan.notes.is_empty(), "{name}: {:?}", scan.notes);
+    }
+    let normals = cloud.clone().with_normals(vec![[0.0, 0.6, 0.8]; 400]).unwrap();
+    for form in PlyForm::ALL {
+        write_ply_as(&folder.path().join("a.ply"), &normals, form).unwrap();
+        let scan = read("a.ply");
+        assert!(error_mm(&scan.cloud, &sample()) < 5e-5, "{form:?}");
+        assert!((scan.cloud.normal(3).unwrap().norm() - 1.0).abs() < 1e-6 && scan.notes.is_empty());
+    }
+    let refused = write_scan(Path::new("a.step"), &cloud).unwrap_err().to_string();
+    says(&refused, &["only .ply", ".csv are written"]);
+}
+
+// ---- STL --------------------------------------------------------------------------------------------------
+
+fn stl(points: &[Point3<f64>]) -> Vec<u8> {
+    let mut out = vec![b's'; 80];
+    out[..5].copy_from_slice(b"solid");
+    out.extend((points.len() as u32 / 3).to_le_bytes());
+    for facet in points.chunks_exact(3) {
+        out.extend([0; 12]);
+        out.extend(floats(facet));
+        out.extend([0; 2]);
+    }
+    out
+}
+
+#[test]
+fn corners_of_facets_come_once() {
+    let points = &sample()[..399];
+    let strip: Vec<_> = points.windows(3).flatten().copied().collect();
+    let scan = accepted("s.stl", &stl(&strip));
+    assert!(error_mm(&scan.cloud, points) < 5e-5 && scan.notes.is_empty());
+    let corner = |p: &Point3<f64>| format!("  Vertex {} {} {}\n", p.x, p.y, p.z);
+    let facet = |f: &[Point3<f64>]| {
+        let corners: String = f.iter().map(corner).collect();
+        format!("facet normal 0 0 1\n outer loop\n{corners} endloop\nendfacet\n")
+    };
+    let ascii = format!("solid a tube\n{}endsolid\n", strip.chunks(3).map(facet).collect::<String>());
+    assert!(error_mm(&accepted("s.STL", ascii.as_bytes()).cloud, points) < 5e-5);
+    says(
+        &refusal("s.stl", ascii.replacen("0.75 ", "0.7x ", 1).as_bytes()),
+        &["line 5, column 10", "a number"],
+    );
+    says(
+        &refusal("s.stl", ascii.replacen("outer", "inner", 1).as_bytes()),
+        &["line 3", "\"inner\"", "vertex"],
+    );
+    says(&refusal("s.stl", ascii.replace("endsolid", "").as_bytes()), &["endsolid", "before the file ends"]);
+}
+
+#[test]
+fn an_stl_that_lies_or_is_cut() {
+    let mut file = stl(&sample()[..399]);
+    file[..5].copy_from_slice(b"STL: ");
+    says(&refusal("s.stl", &file[..file.len() - 1]), &["133 facets announced", "132 found"]);
+    says(&refusal("s.stl", &file[..60]), &["byte 60", "84 bytes"]);
+    file.extend([0; 9]);
+    assert_eq!(accepted("s.stl", &file).notes, ["9 bytes after the last facet passed over"]);
+    file[80..84].copy_from_slice(&u32::MAX.to_le_bytes());
+    says(&refusal("s.stl", &file), &["4294967295 facets announced", "133 found"]);
+    let mut nan = stl(&sample()[..399]);
+    nan[96..100].copy_from_slice(&f32::NAN.to_le_bytes());
+    says(&refusal("s.stl", &nan), &["1 of 399 points"]);
+}
+
+// ---- E57 --------------------------------------------------------------------------------------------------
+
+use ::e57 as format;
+
+/// A pose; points in metres, each with its state.
+type E57Scan = (Option<format::Transform>, Vec<([f64; 3], i64)>);
+
+/// Scans of points in metres, with state (0 valid, 2 invalid), each with a pose.
+fn e57(scans: &[E57Scan], xml: fn(String) -> String) -> Vec<u8> {
+    use format::{E57Writer, Record, RecordDataType, RecordName, RecordValue};
+    let mut out = std::io::Cursor::new(Vec::new());
+    let mut writer = E57Writer::new(&mut out, "test").unwrap();
+    for (pose, points) in scans {
+        let axes = [RecordName::CartesianX, RecordName::CartesianY, RecordName::CartesianZ];
+        let mut prototype: Vec<Record> = axes
+            .map(|name| Record { name, data_type: RecordDataType::Double { min: None, max: None } })
+            .into();
+        let state = RecordDataType::Integer { min: 0, max: 2 };
+        prototype.push(Record { name: RecordName::CartesianInvalidState, data_type: state });
+        let mut scan = writer.add_pointcloud("scan", prototype).unwrap();
+        scan.set_transform(pose.clone());
+        for (p, state) in points {
+            let mut values: Vec<_> = p.map(RecordValue::Double).into();
+            values.push(RecordValue::Integer(*state));
+            scan.add_point(values).unwrap();
+        }
+        scan.finalize().unwrap();
+    }
+    writer.finalize_customized_xml(|text| Ok(xml(text))).unwrap();
+    drop(writer);
+    out.into_inner()
+}
+
+fn metres(points: &[Point3<f64>]) -> Vec<([f64; 3], i64)> {
+    points.iter().map(|p| ((p / 1000.0).coords.into(), 0)).collect()
+}
+
+#[test]
+fn scans_of_an_e57_are_merged_by_their_poses() {
+    let points = sample();
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    // A quarter turn about z, then 1 m along x: the second half is stored where the scanner saw it.
+    let pose = format::Transform {
+        rotation: format::Quaternion { w: half, x: 0.0, y: 0.0, z: half },
+        translation: format::Translation { x: 1.0, y: 0.0, z: 0.0 },
+    };
+    let seen = points[200..].iter().map(|p| ([p.y / 1e3, -(p.x / 1e3 - 1.0), p.z / 1e3], 0)).collect();
+    let mut first = metres(&points[..200]);
+    first.insert(50, ([0.0; 3], 2));
+    let scan = accepted("s.e57", &e57(&[(None, first), (Some(pose), seen)], |xml| xml));
+    assert!(error_mm(&scan.cloud, &points) < 1e-3);
+    assert_eq!(scan.notes, ["2 scans merged by their poses", "1 points marked as invalid skipped"]);
+}
+
+#[test]
+fn an_e57_in_millimetres_is_taken_with_a_note() {
+    let file = e57(&[(None, sample().iter().map(|p| (p.coords.into(), 0)).collect())], |xml| xml);
+    let scan = accepted("s.e57", &file);
+    assert!(error_mm(&scan.cloud, &sample()) < 5e-5);
+    assert_eq!(scan.notes, ["read as mm, though the format prescribes m"]);
+}
+
+#[test]
+fn an_e57_that_lies_or_is_cut_or_is_none() {
+    let good = || vec![(None, metres(&sample()))];
+    let file = e57(&good(), |xml| xml);
+    for cut in [10, 60, 1024, file.len() - 1024, file.len() - 1] {
+        says(&refusal("s.e57", &file[..cut]), &["s.e57", "not a sound E57 file"]);
+    }
+    says(&refusal("s.e57", b"ply\r"), &["end_header"]);
+    says(&refusal("s.e57", b"PK"), &["does not begin"]);
+    let mut flipped = file.clone();
+    flipped[2000] ^= 1;
+    says(&refusal("s.e57", &flipped), &["checksum"]);
+    let many = e57(&good(), |xml| xml.replace("recordCount=\"400\"", "recordCount=\"4000000000\""));
+    says(&refusal("s.e57", &many), &["4000000000 points announced"]);
+    let more = e57(&good(), |xml| xml.replace("recordCount=\"400\"", "recordCount=\"402\""));
+    says(&refusal("s.e57", &more), &["s.e57"]);
+    // Values of no bits: a file of a kilobyte could claim any number of points.
+    let nothing = e57(&good(), |xml| {
+        let empty = |xml: String, axis: &str| {
+            let double = format!("<cartesian{axis} type=\"Float\"");
+            xml.replace(&double, &format!("<cartesian{axis} type=\"Integer\" minimum=\"0\" maximum=\"0\""))
+        };
+        ["X", "Y", "Z"].into_iter().fold(xml, empty).replace("maximum=\"2\"", "maximum=\"0\"")
+    });
+    says(&refusal("s.e57", &nothing), &["no point that differs"]);
+    says(&refusal("s.e57", &e57(&[], |xml| xml)), &["0 points"]);
+    let nan = e57(&[(None, vec![([f64::NAN, 0.0, 0.0], 0); 200])], |xml| xml);
+    says(&refusal("s.e57", &nan), &["200 of 200 points"]);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn no_mutilation_of_an_e57_or_stl_panics(
+        spots in prop::collection::vec((0.0..1.0f64, any::<u8>()), 1..4),
+        cut in 0.0..1.0f64,
+    ) {
+        for (name, mut file) in [
+            ("s.e57", e57(&[(None, metres(&sample()))], |xml| xml)),
+            ("s.stl", stl(&sample())),
+        ] {
+            for (at, byte) in &spots {
+                let at = (at * file.len() as f64) as usize;
+                file[at] = *byte;
+            }
+            let _ = parse_scan(Path::new(name), &file, Unit::Millimetre);
+            file.truncate((cut * file.len() as f64) as usize);
+            let _ = parse_scan(Path::new(name), &file, Unit::Millimetre);
+        }
+    }
+}

@@ -4,10 +4,15 @@
 //! through the whole file, so that a decimal comma is refused and never read as two columns. Also here: lines
 //! and numbers with their place, which ascii PLY uses too.
 
-use nalgebra::Point3;
+use memchr::{memchr, memchr_iter};
+use rayon::prelude::*;
 
 use super::CloudError;
-use super::raw::Raw;
+use super::raw::{Points, Raw};
+
+/// Bytes of text per task, and tasks under way before their points are put together.
+const PIECE: usize = 1 << 17;
+const PIECES: usize = 32;
 
 /// One line of a file.
 pub(super) struct Line<'a> {
@@ -17,6 +22,7 @@ pub(super) struct Line<'a> {
 }
 
 /// The lines of a text that are not blank.
+#[derive(Clone)]
 pub(super) struct Lines<'a> {
     file: &'a str,
     rest: &'a [u8],
@@ -28,6 +34,55 @@ impl<'a> Lines<'a> {
     pub fn new(file: &'a str, text: &'a [u8], first: usize) -> Lines<'a> {
         Lines { file, rest: text, number: first - 1 }
     }
+
+    /// The lines of this that `later`, further on in the same text, has passed.
+    pub fn until(&self, later: &Lines<'a>) -> Lines<'a> {
+        Lines { rest: &self.rest[..self.rest.len() - later.rest.len()], ..*self }
+    }
+
+    /// The next line that is no comment, consumed only if it is of the given kind.
+    fn take_if(&mut self, kind: impl Fn(&Line) -> bool) -> Option<Line<'a>> {
+        let mut ahead = self.clone();
+        let line = ahead.find(|l| !is_comment(l)).filter(kind)?;
+        *self = ahead;
+        Some(line)
+    }
+
+    /// The first `bytes` bytes, and on to the end of the line.
+    fn cut(&mut self, bytes: usize) -> Lines<'a> {
+        let begin = self.clone();
+        let line = self.rest.get(bytes..).and_then(|later| memchr(b'\n', later));
+        let (piece, rest) = self.rest.split_at(line.map_or(self.rest.len(), |end| bytes + end + 1));
+        self.rest = rest;
+        self.number += memchr_iter(b'\n', piece).count();
+        Lines { rest: piece, ..begin }
+    }
+}
+
+/// Passes lines to `each` on all cores, cut into pieces, and what it made of each piece to `put`, in order. Of
+/// several faults the first in the file is returned.
+pub(super) fn in_pieces<'a, T: Send>(
+    lines: &Lines<'a>,
+    empty: impl Fn() -> T + Sync,
+    each: impl Fn(&Line<'a>, &mut T) -> Result<(), CloudError> + Sync,
+    mut put: impl FnMut(T),
+) -> Result<(), CloudError> {
+    let mut lines = lines.clone();
+    let piece = |mut lines: Lines<'a>| {
+        let mut out = empty();
+        lines.try_for_each(|line| each(&line, &mut out)).map(|()| out)
+    };
+    while !lines.rest.is_empty() {
+        let mut pieces: Vec<Lines> = Vec::with_capacity(PIECES);
+        while pieces.len() < PIECES && !lines.rest.is_empty() {
+            pieces.push(lines.cut(PIECE));
+        }
+        let parts: Vec<Result<T, CloudError>> = pieces.into_par_iter().map(piece).collect();
+        for part in parts {
+            put(part?);
+        }
+    }
+    Ok(())
 }
 
 impl<'a> Iterator for Lines<'a> {
@@ -35,7 +90,7 @@ impl<'a> Iterator for Lines<'a> {
 
     fn next(&mut self) -> Option<Line<'a>> {
         while !self.rest.is_empty() {
-            let end = self.rest.iter().position(|&b| b == b'\n');
+            let end = memchr(b'\n', self.rest);
             let (text, rest) = match end {
                 Some(end) => (&self.rest[..end], &self.rest[end + 1..]),
                 None => (self.rest, &[][..]),
@@ -125,11 +180,10 @@ impl Separator {
 /// Reads a text scan.
 pub(super) fn read(file: &str, bytes: &[u8]) -> Result<Raw, CloudError> {
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    let mut lines = Lines::new(file, bytes, 1).filter(|l| !is_comment(l)).peekable();
-    let announced = lines.next_if(|l| count_line(l).is_some()).and_then(|l| count_line(&l));
-    let columns = lines.next_if(is_header).map_or([0, 1, 2], |l| columns(&l));
-    let mut raw = Raw::default();
-    let Some(first) = lines.peek() else {
+    let mut lines = Lines::new(file, bytes, 1);
+    let announced = lines.take_if(|l| count_line(l).is_some()).and_then(|l| count_line(&l));
+    let columns = lines.take_if(is_header).map_or([0, 1, 2], |l| columns(&l));
+    let Some(first) = lines.clone().find(|l| !is_comment(l)) else {
         return Err(CloudError::Truncated {
             file: file.to_owned(),
             what: "points".to_owned(),
@@ -137,13 +191,18 @@ pub(super) fn read(file: &str, bytes: &[u8]) -> Result<Raw, CloudError> {
             found: 0,
         });
     };
-    let separator = Separator::of(first);
+    let separator = Separator::of(&first);
     // From the length of the first line; the file's size bounds it.
-    raw.points.reserve(bytes.len() / (first.text.len() + 1));
-    for line in lines {
-        raw.points.push(point(&line, separator, columns)?);
-    }
-    let found = raw.points.len() as u64;
+    let mut points = Vec::with_capacity(bytes.len() / (first.text.len() + 1));
+    let take = |line: &Line, out: &mut Vec<[f64; 3]>| {
+        if !is_comment(line) {
+            out.push(point(line, separator, columns)?);
+        }
+        Ok(())
+    };
+    in_pieces(&lines, Vec::new, take, |mut part| points.append(&mut part))?;
+    let found = points.len() as u64;
+    let mut raw = Raw::new(Points::Double(points));
     match announced {
         Some(expected) if expected > found => {
             let (file, what) = (file.to_owned(), "points".to_owned());
@@ -190,7 +249,7 @@ fn columns(header: &Line) -> [usize; 3] {
     }
 }
 
-fn point(line: &Line, separator: Separator, columns: [usize; 3]) -> Result<Point3<f64>, CloudError> {
+fn point(line: &Line, separator: Separator, columns: [usize; 3]) -> Result<[f64; 3], CloudError> {
     let mut at = [None; 3];
     let last = columns[0].max(columns[1]).max(columns[2]);
     for (i, value) in separator.split(line).enumerate().take(last + 1) {
@@ -198,8 +257,8 @@ fn point(line: &Line, separator: Separator, columns: [usize; 3]) -> Result<Point
             at[axis] = Some(value);
         }
     }
-    let mut out = Point3::origin();
-    for (slot, value) in at.into_iter().zip(out.iter_mut()) {
+    let mut out = [0.0; 3];
+    for (slot, value) in at.into_iter().zip(&mut out) {
         let word = slot.ok_or_else(|| line.refuse_end("at least x, y and z on every line"))?;
         *value = match line.number(word) {
             Err(_) if word.contains(&b',') => Err(line.refuse(word, "a number with a decimal point"))?,

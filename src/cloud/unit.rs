@@ -40,6 +40,17 @@ impl Unit {
         }
     }
 
+    /// The unit of a file whose format prescribes this one, `given` being what the operator said. Some programs
+    /// write what they have: then the prescribed one gives no tube's extent and the given one does.
+    pub(super) fn or_given(self, given: Unit, extent: f64, notes: &mut Vec<String>) -> Unit {
+        let fits = |unit: Unit| TUBE_MM.contains(&(extent * unit.millimetres()));
+        if fits(self) || !fits(given) {
+            return self;
+        }
+        notes.push(format!("read as {}, though the format prescribes {}", given.word(), self.word()));
+        given
+    }
+
     /// Refuses an extent (a bounding box's diagonal, read in this unit) that no tube has, with a guess.
     pub(super) fn check_extent(self, file: &str, extent_mm: f64) -> Result<(), CloudError> {
         if TUBE_MM.contains(&extent_mm) {
@@ -86,6 +97,16 @@ mod tests {
         assert_eq!(guess(500_000.0), None);
         assert_eq!(guess(500.0), Some(Unit::Millimetre));
         assert_eq!(guess(0.0), None);
+    }
+
+    #[test]
+    fn the_prescribed_unit_yields_only_where_it_cannot_be() {
+        let mut notes = Vec::new();
+        assert_eq!(Unit::Metre.or_given(Unit::Millimetre, 0.5, &mut notes), Unit::Metre);
+        assert_eq!(Unit::Metre.or_given(Unit::Millimetre, 1e9, &mut notes), Unit::Metre);
+        assert!(notes.is_empty());
+        assert_eq!(Unit::Metre.or_given(Unit::Millimetre, 500.0, &mut notes), Unit::Millimetre);
+        assert_eq!(notes, ["read as mm, though the format prescribes m"]);
     }
 
     #[test]

@@ -1,69 +1,175 @@
 //! Voxels: ordering a cloud so that neighbours in space are neighbours in memory, and thinning it.
 //!
 //! The order is Morton's (z-order) over a grid anchored at the cloud's own corner: searches on a cloud in
-//! this order are 2 to 4 times faster than on one in scan order.
+//! this order are 2 to 4 times faster than on one in scan order. Points are not sorted: occupied voxels are numbered
+//! in a small table, task by task, and only the voxels are sorted.
 
-use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::PointCloud;
-
-/// Cells per axis that a 63-bit Morton code can tell apart.
-const MOST_CELLS: f64 = (1u64 << 21) as f64;
+use super::cells::{Cells, Numbers, numbers};
+use super::raw::TASK;
 
 impl PointCloud {
     /// The same points sorted by voxel of the given edge, within a voxel by their index. A cell too small
     /// for the grid (or not above 0) is enlarged to the finest that the grid can hold.
     pub fn voxel_sorted(&self, cell_mm: f64) -> PointCloud {
-        let order: Vec<usize> = self.voxel_order(cell_mm).iter().map(|&(_, i)| i as usize).collect();
-        self.select(&order)
+        let Some(voxels) = Voxels::of(self, cell_mm) else { return self.clone() };
+        // Where each voxel's next point goes, by the voxels' numbers.
+        let mut next = vec![0; voxels.totals.len()];
+        let mut end = 0;
+        for &voxel in &voxels.order {
+            next[voxel as usize] = end;
+            end += voxels.totals[voxel as usize].count as u32;
+        }
+        let mut order = vec![0; self.len()];
+        let all = voxels.tasks.iter().flat_map(|task| task.ids.iter().map(|&id| task.global[id as usize]));
+        for (i, voxel) in (0..).zip(all) {
+            let at = &mut next[voxel as usize];
+            order[*at as usize] = i;
+            *at += 1;
+        }
+        self.pick(&order)
     }
 
     /// One point per occupied voxel, the one nearest to the mean of the voxel's points, in voxel order. No
     /// point is moved, so noise is not averaged away.
     pub fn thinned(&self, cell_mm: f64) -> PointCloud {
-        let order = self.voxel_order(cell_mm);
-        let kept: Vec<usize> = order.chunk_by(|a, b| a.0 == b.0).map(|voxel| self.central(voxel)).collect();
-        self.select(&kept)
-    }
-
-    /// Morton code and index of every point, sorted.
-    fn voxel_order(&self, cell_mm: f64) -> Vec<(u64, u32)> {
-        let Some((min, max)) = self.offset_bounds() else { return Vec::new() };
-        let min = min.cast::<f64>();
-        let finest = (max.cast::<f64>() - min).max() / (MOST_CELLS - 1.0);
-        // f64::max also answers `finest` for NaN; 1.0 only when all points are one.
-        let cell = cell_mm.max(finest);
-        let cell = if cell > 0.0 { cell } else { 1.0 };
-        let mut order: Vec<(u64, u32)> = (0..self.len())
-            .into_par_iter()
-            .map(|i| {
-                let at = (self.offset(i) - min) / cell;
-                (morton(&at), i as u32)
-            })
-            .collect();
-        order.par_sort_unstable();
-        order
-    }
-
-    /// Index of the voxel's point nearest to the voxel's mean; the lowest where several are.
-    fn central(&self, voxel: &[(u64, u32)]) -> usize {
-        let sum: Vector3<f64> = voxel.iter().map(|&(_, i)| self.offset(i as usize)).sum();
-        let mean = sum / voxel.len() as f64;
-        let mut best = (f64::INFINITY, 0);
-        for &(_, i) in voxel {
-            let distance = (self.offset(i as usize) - mean).norm_squared();
-            if distance < best.0 {
-                best = (distance, i as usize);
-            }
-        }
-        best.1
+        let Some(voxels) = Voxels::of(self, cell_mm) else { return self.clone() };
+        let central = voxels.central(self);
+        let kept: Vec<u32> = voxels.order.iter().map(|&voxel| central[voxel as usize]).collect();
+        self.pick(&kept)
     }
 }
 
-/// Interleaves the bits of the three cell numbers.
-fn morton(at: &Vector3<f64>) -> u64 {
-    spread(at.x as u64) | spread(at.y as u64) << 1 | spread(at.z as u64) << 2
+/// A cloud's occupied voxels.
+struct Voxels {
+    tasks: Vec<Task>,
+    /// By number.
+    totals: Vec<Total>,
+    /// The numbers in Morton's order.
+    order: Vec<u32>,
+}
+
+/// What consecutive points know of their voxels.
+struct Task {
+    /// The task's own number of each point's voxel.
+    ids: Vec<u32>,
+    own: Numbers,
+    totals: Vec<Total>,
+    /// The cloud's number for each of the task's own.
+    global: Vec<u32>,
+}
+
+/// Number and sum of a voxel's points.
+#[derive(Clone, Copy, Default)]
+struct Total {
+    sum: [f64; 3],
+    count: f64,
+}
+
+impl Total {
+    fn add(&mut self, other: &Total) {
+        self.sum.iter_mut().zip(other.sum).for_each(|(a, b)| *a += b);
+        self.count += other.count;
+    }
+
+    fn mean(&self) -> [f64; 3] {
+        self.sum.map(|v| v / self.count)
+    }
+}
+
+impl Voxels {
+    /// None for an empty cloud.
+    fn of(cloud: &PointCloud, cell_mm: f64) -> Option<Voxels> {
+        let cells = Cells::of(cloud, cell_mm)?;
+        // Fixed tasks, put together in order: the same sums whatever the number of threads.
+        let mut tasks: Vec<Task> =
+            in_tasks(cloud.offsets()).map(|(_, points)| Task::of(&cells, points)).collect();
+        let (mut all, mut totals) = (Numbers::new(), Vec::new());
+        for task in &mut tasks {
+            for (&key, total) in task.own.keys.iter().zip(&task.totals) {
+                let number = all.number(key);
+                if number as usize == totals.len() {
+                    totals.push(Total::default());
+                }
+                totals[number as usize].add(total);
+                task.global.push(number);
+            }
+        }
+        let mut order: Vec<(u64, u32)> = all.keys.iter().map(|&key| morton(key)).zip(0..).collect();
+        if order.len() > TASK {
+            order.par_sort_unstable()
+        } else {
+            order.sort_unstable()
+        }
+        Some(Voxels { tasks, totals, order: order.into_iter().map(|(_, number)| number).collect() })
+    }
+
+    /// By voxel's number, the index of the point nearest to the mean; the lowest where several are.
+    fn central(&self, cloud: &PointCloud) -> Vec<u32> {
+        let tasks = in_tasks(cloud.offsets());
+        let parts: Vec<Vec<(f64, u32)>> = tasks.map(|(k, points)| self.nearest(k, points)).collect();
+        let mut best = vec![(f64::INFINITY, 0); self.totals.len()];
+        for (task, part) in self.tasks.iter().zip(parts) {
+            for (&voxel, candidate) in task.global.iter().zip(part) {
+                let best = &mut best[voxel as usize];
+                if candidate.0 < best.0 {
+                    *best = candidate;
+                }
+            }
+        }
+        best.into_iter().map(|(_, index)| index).collect()
+    }
+
+    /// The same among one task's points, by the task's own numbers.
+    fn nearest(&self, k: usize, points: &[[f32; 3]]) -> Vec<(f64, u32)> {
+        let task = &self.tasks[k];
+        let means: Vec<[f64; 3]> = task.global.iter().map(|&v| self.totals[v as usize].mean()).collect();
+        let mut best = vec![(f64::INFINITY, 0); means.len()];
+        for ((p, &id), index) in points.iter().zip(&task.ids).zip((k * TASK) as u32..) {
+            let mean = &means[id as usize];
+            let [x, y, z] = [0, 1, 2].map(|i| f64::from(p[i]) - mean[i]);
+            let distance = x * x + y * y + z * z;
+            let best = &mut best[id as usize];
+            if distance < best.0 {
+                *best = (distance, index);
+            }
+        }
+        best
+    }
+}
+
+impl Task {
+    fn of(cells: &Cells, points: &[[f32; 3]]) -> Task {
+        let (mut own, mut totals) = (Numbers::new(), Vec::new());
+        let mut ids = Vec::with_capacity(points.len());
+        // Points follow a scan line: the voxel is often the last one.
+        let mut last = (u64::MAX, 0);
+        for &p in points {
+            let key = cells.key(p);
+            if key != last.0 {
+                last = (key, own.number(key));
+                if last.1 as usize == totals.len() {
+                    totals.push(Total::default());
+                }
+            }
+            ids.push(last.1);
+            totals[last.1 as usize].add(&Total { sum: p.map(f64::from), count: 1.0 });
+        }
+        Task { ids, own, totals, global: Vec::new() }
+    }
+}
+
+/// A cloud's points in tasks of a fixed size, with the tasks' numbers.
+fn in_tasks(points: &[[f32; 3]]) -> impl IndexedParallelIterator<Item = (usize, &[[f32; 3]])> {
+    points.par_chunks(TASK).enumerate()
+}
+
+/// Interleaves the bits of a cell's three numbers.
+fn morton(key: u64) -> u64 {
+    let [x, y, z] = numbers(key);
+    spread(x) | spread(y) << 1 | spread(z) << 2
 }
 
 /// Puts two empty bits between any two of the lowest 21.

@@ -1,34 +1,31 @@
 //! The data of an ascii PLY file: one line per record.
 
-use super::super::text::{Line, Lines};
+use super::super::text::{Line, Lines, in_pieces};
 use super::header::{Element, Header, Kind};
 use super::{CloudError, Raw, Sink, Wanted, truncated};
 
 /// Reads the vertices, passing over the lines that stand before them.
 pub(super) fn read(file: &str, bytes: &[u8], header: &Header) -> Result<Raw, CloudError> {
     let mut lines = Lines::new(file, &bytes[header.data..], header.data_line);
-    let mut out = Raw::default();
+    let mut out = Sink::of_text(None, 0);
     for element in header.elements.iter().filter(|e| !e.properties.is_empty()) {
-        let Some(wanted) = Wanted::of(element).filter(|_| element.name == "vertex") else {
-            skip(file, &mut lines, element)?;
+        let begin = lines.clone();
+        skip(file, &mut lines, element)?;
+        if element.name != "vertex" {
             continue;
-        };
-        // A value takes two bytes or more with its separator: the file's size bounds the allocation.
-        let fits = bytes.len() as u64 / (2 * element.properties.len() as u64);
-        let mut sink = Sink::new(wanted, element.count.min(fits) as usize);
-        let mut values = vec![0.0; element.properties.len()];
-        for done in 0..element.count {
-            let line = lines.next().ok_or_else(|| truncated(file, element, done))?;
-            record(&line, element, &mut values)?;
-            sink.push(&values);
         }
-        out = sink.raw;
+        // Checked by now: this many vertices are there.
+        out = Sink::of_text(Wanted::of(element), element.count as usize);
+        let empty = || (vec![0.0; element.properties.len()], Sink::of_text(Wanted::of(element), 0));
+        let take = |line: &Line, (values, sink): &mut (Vec<f64>, Sink)| {
+            record(line, element, values)?;
+            sink.push(values);
+            Ok(())
+        };
+        in_pieces(&begin.until(&lines), empty, take, |(_, part)| out.append(part))?;
     }
-    let rest = lines.count();
-    if !header.more && rest > 0 {
-        out.notes.push(format!("{rest} lines after the last vertex passed over"));
-    }
-    Ok(out)
+    let rest = if header.more { 0 } else { lines.count() };
+    Ok(out.raw((rest > 0).then(|| format!("{rest} lines after the last vertex passed over"))))
 }
 
 fn skip(file: &str, lines: &mut Lines, element: &Element) -> Result<(), CloudError> {

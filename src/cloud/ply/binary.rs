@@ -1,9 +1,7 @@
 //! The data of a binary PLY file, either byte order.
 
-use nalgebra::Point3;
-
 use super::header::{Element, Header, Kind, Scalar};
-use super::{CloudError, Raw, Sink, Wanted, truncated};
+use super::{CloudError, Points, Raw, Sink, Wanted, truncated};
 
 /// The bytes and how far they are read.
 struct Cursor<'a> {
@@ -23,28 +21,26 @@ impl<'a> Cursor<'a> {
 /// Reads the vertices, passing over what stands before them.
 pub(super) fn read<const BIG: bool>(file: &str, bytes: &[u8], header: &Header) -> Result<Raw, CloudError> {
     let mut cursor = Cursor { bytes, at: header.data };
-    let mut out = Raw::default();
+    let mut out = Sink::new(None, 0);
     for element in &header.elements {
-        let mut sink = None;
-        if element.name == "vertex"
-            && let Some(wanted) = Wanted::of(element)
-        {
+        if element.name == "vertex" {
             // The smallest record is three bytes: a header cannot make this allocate beyond the file's size.
             let smallest = element.stride().unwrap_or(3).max(3) as u64;
             let fits = (bytes.len() - cursor.at) as u64 / smallest;
-            sink = Some(Sink::new(wanted, element.count.min(fits) as usize));
+            out = Sink::new(Wanted::of(element), element.count.min(fits) as usize);
         }
         match element.stride() {
-            Some(stride) => fixed::<BIG>(file, &mut cursor, element, stride, sink.as_mut())?,
-            None => varying::<BIG>(file, &mut cursor, element, sink.as_mut())?,
+            Some(stride) => fixed::<BIG>(file, &mut cursor, element, stride, &mut out)?,
+            None => varying::<BIG>(file, &mut cursor, element, &mut out)?,
         }
-        out = sink.map_or(out, |s| s.raw);
     }
-    let rest = bytes.len() - cursor.at;
-    if !header.more && rest > 0 {
-        out.notes.push(format!("{rest} bytes after the last vertex passed over"));
-    }
-    Ok(out)
+    let rest = (bytes.len() - cursor.at) as u64;
+    Ok(out.raw(left_over(header, rest)))
+}
+
+/// What is said of the bytes after the last vertex.
+pub(super) fn left_over(header: &Header, rest: u64) -> Option<String> {
+    (!header.more && rest > 0).then(|| format!("{rest} bytes after the last vertex passed over"))
 }
 
 /// Records of one size.
@@ -53,7 +49,7 @@ fn fixed<const BIG: bool>(
     cursor: &mut Cursor,
     element: &Element,
     stride: usize,
-    sink: Option<&mut Sink>,
+    sink: &mut Sink,
 ) -> Result<(), CloudError> {
     if stride == 0 {
         return Ok(());
@@ -62,31 +58,40 @@ fn fixed<const BIG: bool>(
     let whole = usize::try_from(element.count).ok().and_then(|n| n.checked_mul(stride));
     let data =
         whole.and_then(|n| cursor.take(n)).ok_or_else(|| truncated(file, element, (left / stride) as u64))?;
-    let Some(sink) = sink else { return Ok(()) };
-    let layout = layout(element);
-    let [x, y, z] = sink.wanted.point.map(|i| layout[i]);
-    let value = |record: &[u8], (at, scalar): (usize, Scalar)| decode::<BIG>(&record[at..], scalar);
-    sink.raw
-        .points
-        .extend(data.chunks_exact(stride).map(|r| Point3::new(value(r, x), value(r, y), value(r, z))));
-    if let (Some(at), Some(normals)) = (sink.wanted.normal, &mut sink.raw.normals) {
-        let at = at.map(|i| layout[i]);
-        normals.extend(data.chunks_exact(stride).map(|r| at.map(|p| value(r, p) as f32)));
+    if element.name == "vertex" {
+        sink.records::<BIG>(data, stride);
     }
     Ok(())
 }
 
-/// Offset and type of each property in a record of scalars.
-fn layout(element: &Element) -> Vec<(usize, Scalar)> {
-    let mut at = 0;
-    let place = |p: &super::header::Property| match p.kind {
-        Kind::Scalar(s) => {
-            at += s.size();
-            (at - s.size(), s)
+impl Sink {
+    /// Takes in whole records of one size.
+    pub fn records<const BIG: bool>(&mut self, data: &[u8], stride: usize) {
+        let Some(wanted) = &self.wanted else { return };
+        let records = data.chunks_exact(stride);
+        let [x, y, z] = wanted.point.map(|i| wanted.layout[i]);
+        match &mut self.points {
+            Points::Single(out) if [x.1, y.1, z.1] == [Scalar::F32; 3] => {
+                let at = |r: &[u8], p: usize| f32::from_le_bytes(ordered::<BIG, 4>(&r[p..p + 4]));
+                out.extend(records.map(|r| [at(r, x.0), at(r, y.0), at(r, z.0)]));
+            }
+            Points::Double(out) if [x.1, y.1, z.1] == [Scalar::F64; 3] => {
+                let at = |r: &[u8], p: usize| f64::from_le_bytes(ordered::<BIG, 8>(&r[p..p + 8]));
+                out.extend(records.map(|r| [at(r, x.0), at(r, y.0), at(r, z.0)]));
+            }
+            Points::Single(out) => {
+                out.extend(records.map(|r| [x, y, z].map(|p| decode::<BIG>(&r[p.0..], p.1) as f32)));
+            }
+            Points::Double(out) => {
+                out.extend(records.map(|r| [x, y, z].map(|p| decode::<BIG>(&r[p.0..], p.1))));
+            }
         }
-        Kind::List { item, .. } => (at, item),
-    };
-    element.properties.iter().map(place).collect()
+        if let (Some(at), Some(normals)) = (wanted.normal, &mut self.normals) {
+            let at = at.map(|i| wanted.layout[i]);
+            let records = data.chunks_exact(stride);
+            normals.extend(records.map(|r| at.map(|p| decode::<BIG>(&r[p.0..], p.1) as f32)));
+        }
+    }
 }
 
 /// Records with lists: one by one.
@@ -94,7 +99,7 @@ fn varying<const BIG: bool>(
     file: &str,
     cursor: &mut Cursor,
     element: &Element,
-    mut sink: Option<&mut Sink>,
+    sink: &mut Sink,
 ) -> Result<(), CloudError> {
     let mut values = vec![0.0; element.properties.len()];
     // Each record consumes a byte or more, so the file's size bounds the loop whatever the header says.
@@ -113,7 +118,7 @@ fn varying<const BIG: bool>(
                 }
             }
         }
-        if let Some(sink) = sink.as_deref_mut() {
+        if element.name == "vertex" {
             sink.push(&values);
         }
     }
