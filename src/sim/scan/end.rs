@@ -32,8 +32,8 @@ pub struct Burr {
     pub over_rad: f64,
 }
 
-/// How far back from the face a burr bends the surface out, in its heights.
-const FLARE_HEIGHTS: f64 = 2.0;
+/// How far from the edge a burr reaches, along the tube and towards its axis, in its heights.
+const FADE_HEIGHTS: f64 = 2.0;
 /// Width of a tooth in heights: no steeper than a ray can be followed to.
 const TOOTH_HEIGHTS: f64 = 4.0;
 /// Share of the burr's field that is safe to advance: teeth and flare are slopes.
@@ -95,8 +95,10 @@ impl Cut {
         }
         let from = p - self.centre;
         let height = burr.height_at(from.dot(&self.z).atan2(from.dot(&self.y)), self.radius_mm);
-        let depth = (-beyond).max(0.0) / (FLARE_HEIGHTS * burr.height_mm);
-        let (lateral, beyond) = (lateral_mm - height * (1.0 - depth).max(0.0), beyond - height);
+        // Outwards it fades along the tube, along the tube it fades towards the bore.
+        let fade = |depth_mm: f64| (1.0 - depth_mm.max(0.0) / (FADE_HEIGHTS * burr.height_mm)).max(0.0);
+        let lateral = lateral_mm - height * fade(-beyond);
+        let beyond = beyond - height * fade(-lateral_mm);
         Clipped { distance_mm: lateral.max(beyond), stride: BURR_STRIDE, face: beyond > lateral }
     }
 }
