@@ -19,6 +19,8 @@ const LEAST_AGREEING: f64 = 0.6;
 /// Points this far from the outside, in standard deviations of the noise, show where it stops. Few are within it, where
 /// the face's rim would pile up.
 const OUTSIDE_SIGMAS: std::ops::Range<f64> = -1.0..3.5;
+/// An outline is no sharper than this share of the noise: the rim of a face that does not show by itself blurs it.
+const RIM_SIGMAS: f64 = 0.4;
 /// What differs by more than this many standard deviations is not the same.
 const DIFFERENT_SIGMAS: f64 = 4.0;
 
@@ -92,10 +94,10 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<End
             return Some(End::Found(Place { at_mm: face.at_mm, sigma_mm, cut_rad, by_outline: false }));
         }
     }
-    Some(by_outline(&outline))
+    Some(by_outline(&outline, noise_mm))
 }
 
-fn by_outline(outline: &Outline) -> End {
+fn by_outline(outline: &Outline, noise_mm: f64) -> End {
     let at_mm = outline.at_mm;
     let slope = outline.loose_size();
     if slope - DIFFERENT_SIGMAS * outline.loose_sigma > MOST_OBLIQUE {
@@ -105,7 +107,8 @@ fn by_outline(outline: &Outline) -> End {
         return End::Ragged { at_mm };
     }
     let cut_rad = cut(&outline.slope, &outline.slope_variance);
-    End::Found(Place { at_mm, sigma_mm: outline.sigma_mm, cut_rad, by_outline: true })
+    let sigma_mm = outline.sigma_mm.hypot(RIM_SIGMAS * noise_mm);
+    End::Found(Place { at_mm, sigma_mm, cut_rad, by_outline: true })
 }
 
 /// Angle from square of a plane with this slope, without what its uncertainty adds to it on average.
@@ -119,4 +122,150 @@ fn cut(slope: &[f64; 2], variance: &[f64; 3]) -> Option<(f64, f64)> {
     // Near square the direction is open, and so the worse of the two counts.
     let sigma = if size > 2.0 * across { sigma } else { sigma.max(across) };
     (sigma.atan() <= MAX_CUT_SIGMA_RAD).then_some((angle, sigma.atan()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::f64::consts::TAU;
+
+    const RADIUS: f64 = 10.0;
+    const NOISE: f64 = 0.02;
+
+    /// Stripes 0.7 mm apart along half of a tube that begins at the plane x = at + slope y, a little irregular, with
+    /// points every 0.4 mm. Skewed, as a hand guides them.
+    fn half_tube(at: f64, slope: f64) -> Vec<Point3<f64>> {
+        let mut points = Vec::new();
+        for stripe in -40..80 {
+            for k in 0..80 {
+                let turn = -1.6 + 0.04 * f64::from(k);
+                let (i, k) = (f64::from(stripe), f64::from(k));
+                let x = 0.7 * i + 0.02 * k + 0.1 * (5.1 * i).sin();
+                let r = RADIUS + NOISE * (1.7 * i + 2.3 * k).sin();
+                let p = Point3::new(x, r * turn.cos(), r * turn.sin());
+                if p.x > at + slope * p.y && p.x < 50.0 {
+                    points.push(p);
+                }
+            }
+        }
+        points
+    }
+
+    /// The ring between bore and outside, as a grid.
+    fn ring(at: f64, slope: f64) -> Vec<Point3<f64>> {
+        let grid = (-25..=25).flat_map(|i| (-25..=25).map(move |k| (0.4 * f64::from(i), 0.4 * f64::from(k))));
+        grid.filter(|(y, z)| (8.5..RADIUS).contains(&y.hypot(*z)))
+            .map(|(y, z)| Point3::new(at + slope * y + NOISE * (7.0 * y + 3.0 * z).sin(), y, z))
+            .collect()
+    }
+
+    fn found(points: &[Point3<f64>]) -> Place {
+        match find(points, RADIUS, NOISE) {
+            Some(End::Found(place)) => place,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_square_end_is_found_within_its_sigma() {
+        for step in 0..20 {
+            let at = 3.0 + 0.05 * f64::from(step);
+            let end = found(&half_tube(at, 0.0));
+            assert!((end.at_mm - at).abs() < 3.0 * end.sigma_mm, "{end:?} at {at}");
+            assert!(end.sigma_mm < 0.35, "better than half a stripe: {end:?}");
+            assert!(end.by_outline);
+        }
+    }
+
+    #[test]
+    fn the_cut_goes_through_the_axis_where_the_face_says() {
+        let slope = 3f64.to_radians().tan();
+        let mut points = half_tube(3.3, slope);
+        points.extend(ring(3.3, slope));
+        let end = found(&points);
+        assert!(!end.by_outline);
+        assert!(end.sigma_mm < 0.01 && (end.at_mm - 3.3).abs() < 4.0 * end.sigma_mm, "{end:?}");
+        let (cut, sigma) = end.cut_rad.unwrap();
+        assert!((cut.to_degrees() - 3.0).abs() < 0.1 && sigma.to_degrees() < 0.1, "{end:?}");
+    }
+
+    #[test]
+    fn the_bore_is_no_face() {
+        let mut points = half_tube(3.3, 0.0);
+        // The far side of the bore, seen through the opening.
+        for i in 0..400 {
+            let turn = 0.3 + 2.5 * (f64::from(i) * 0.618).fract();
+            points.push(Point3::new(3.3 + 0.004 * f64::from(i), 8.5 * turn.cos(), -8.5 * turn.sin()));
+        }
+        let end = found(&points);
+        assert!(end.by_outline && (end.at_mm - 3.3).abs() < 3.0 * end.sigma_mm, "{end:?}");
+    }
+
+    #[test]
+    fn a_burr_moves_the_end_by_less_than_its_sigma() {
+        let mut points = half_tube(3.3, 0.0);
+        let clean = found(&points);
+        // A lip 0.3 mm long over a fifth of what is seen.
+        for i in 0..60 {
+            let turn = 0.2 + 0.6 * f64::from(i) / 60.0;
+            points.push(Point3::new(
+                3.0 + 0.3 * (f64::from(i) * 0.618).fract(),
+                10.0 * turn.cos(),
+                10.0 * turn.sin(),
+            ));
+        }
+        let end = found(&points);
+        assert!((end.at_mm - clean.at_mm).abs() < clean.sigma_mm, "{end:?} {clean:?}");
+        points.extend(ring(3.3, 0.0));
+        for p in points.iter_mut().filter(|p| p.x < 3.4 && p.y > 9.0 && p.y.hypot(p.z) < 9.95) {
+            p.x -= 0.25;
+        }
+        let end = found(&points);
+        assert!(!end.by_outline && (end.at_mm - 3.3).abs() < 3.0 * end.sigma_mm, "{end:?}");
+    }
+
+    #[test]
+    fn the_edge_of_the_scan_is_no_end() {
+        let Some(End::CutOff { slope_rad, .. }) = find(&half_tube(3.0, 0.6), RADIUS, NOISE) else {
+            panic!("31 degrees from square is no saw's work");
+        };
+        assert!((slope_rad.to_degrees() - 31.0).abs() < 3.0, "{}", slope_rad.to_degrees());
+        // Steps of two radii: no plane at all.
+        let steps = |p: &Point3<f64>| p.x > 20.0 * (0.8 * p.z).sin().signum();
+        let ragged: Vec<_> = half_tube(-20.0, 0.0).into_iter().filter(steps).collect();
+        assert!(!matches!(find(&ragged, RADIUS, NOISE), Some(End::Found(_))));
+    }
+
+    #[test]
+    fn an_end_that_was_not_scanned_is_unknown() {
+        assert_eq!(find(&[], RADIUS, NOISE), None);
+        assert_eq!(find(&half_tube(3.0, 0.0)[..2], RADIUS, NOISE), None);
+        assert_eq!(find(&[Point3::new(f64::NAN, 0.0, 0.0)], RADIUS, NOISE), None);
+    }
+
+    #[test]
+    fn stray_points_before_the_end_do_not_move_it() {
+        let mut points = half_tube(3.3, 0.0);
+        let clean = found(&points);
+        points.extend([-30.0, -12.0, -4.0].map(|x| Point3::new(x, 10.0, 0.1)));
+        assert!((found(&points).at_mm - clean.at_mm).abs() < clean.sigma_mm);
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+        #[test]
+        fn the_end_moves_and_turns_with_the_tube(shift in -500.0..500.0f64, turn in 0.0..TAU, tilt in -0.08..0.08f64) {
+            let mut points = half_tube(3.3, tilt);
+            points.extend(ring(3.3, tilt));
+            let still = found(&points);
+            let (sin, cos) = turn.sin_cos();
+            for p in &mut points {
+                *p = Point3::new(p.x + shift, cos * p.y - sin * p.z, sin * p.y + cos * p.z);
+            }
+            let moved = found(&points);
+            prop_assert!(!moved.by_outline);
+            prop_assert!((moved.at_mm - shift - still.at_mm).abs() < still.sigma_mm, "{moved:?} {still:?}");
+        }
+    }
 }

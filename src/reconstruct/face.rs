@@ -12,6 +12,9 @@ const TRIALS: usize = 400;
 const VOTERS: usize = 1500;
 /// Points nearer than this to the outside may belong to it, in standard deviations of the noise.
 const EDGE_SIGMAS: f64 = 4.0;
+/// A face's points differ by more than this in their distance from the axis, in standard deviations of the noise; where
+/// only the bore was seen, they do not.
+const BROAD_SIGMAS: f64 = 6.0;
 /// Fewest points of a face. The scanner sees all of it or nothing: points lie in all but one of the sixths.
 const MIN_POINTS: usize = 12;
 const SIXTHS: usize = 6;
@@ -59,6 +62,10 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, place: &Searc
     // The bore begins where the face ends: its first points would draw the plane inwards.
     let mut rings: Vec<f64> = on_plane(&candidates, &plane, 2.0 * noise_mm).map(|p| p.y.hypot(p.z)).collect();
     rings.sort_by(f64::total_cmp);
+    let (inmost, outmost) = (rings.get(rings.len() / 10)?, rings.get(rings.len() * 9 / 10)?);
+    if outmost - inmost < BROAD_SIGMAS * noise_mm {
+        return None;
+    }
     let bore = rings.get(rings.len() / 50)? + EDGE_SIGMAS * noise_mm;
     let face = |p: &&Point3<f64>| p.y.hypot(p.z) > bore;
     if on_plane(&candidates, &plane, 3.0 * noise_mm).filter(face).count() >= 3 * MIN_POINTS {

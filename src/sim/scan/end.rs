@@ -115,3 +115,78 @@ impl Burr {
         self.height_mm * arch * (0.5 + 0.25 * (teeth.sin() + (0.618 * teeth).sin()))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Density, ScanSettings, SimulatedScan, TubeShape, scan};
+    use super::*;
+    use crate::tube::Lra;
+
+    /// A tube of 20 mm along x from 0 to 200, seen slantwise onto its first face, without noise.
+    fn seen(end: EndShape) -> SimulatedScan {
+        let lra = Lra { bends: vec![], last_length_mm: 200.0 };
+        let square = EndShape::default();
+        let shape = TubeShape { wall_mm: 2.0, ends: [end, square], ..TubeShape::round(lra, 20.0) };
+        let settings = ScanSettings {
+            density: Density::Points(60_000),
+            noise_mm: 0.0,
+            outlier_share: 0.0,
+            random_pose: false,
+            sight: Some(Vector3::new(1.0, 0.0, -1.0)),
+            ..ScanSettings::default()
+        };
+        scan(&shape, &settings, 5)
+    }
+
+    /// On the outside, the face's plane, the bore: and nothing else.
+    fn counts(scan: &SimulatedScan, beyond: impl Fn(&Point3<f64>) -> f64) -> [usize; 3] {
+        let mut counts = [0; 3];
+        for p in &scan.points {
+            let (ring, beyond) = (p.y.hypot(p.z), beyond(p));
+            if (ring - 10.0).abs() < 1e-6 && beyond < 1e-6 {
+                counts[0] += 1;
+            } else if beyond.abs() < 1e-6 && (8.0 - 1e-6..10.0).contains(&ring) {
+                counts[1] += 1;
+            } else {
+                assert!((ring - 8.0).abs() < 1e-6 && (-10.0..0.0).contains(&beyond), "{p}");
+                counts[2] += 1;
+            }
+        }
+        counts
+    }
+
+    #[test]
+    fn with_a_wall_the_face_and_a_little_of_the_bore_show() {
+        let [outside, face, bore] = counts(&seen(EndShape::default()), |p| -p.x);
+        assert!(outside > 20_000 && face > 300 && bore > 300, "{outside} {face} {bore}");
+    }
+
+    #[test]
+    fn an_oblique_face_lies_on_its_plane_and_the_tube_goes_on_to_it() {
+        let (cut_rad, longest_rad) = (0.08, 2.0);
+        let scan = seen(EndShape { cut_rad, longest_rad, burr: None });
+        let along = |p: &Point3<f64>| p.y * longest_rad.cos() + p.z * longest_rad.sin();
+        // Longest towards `longest_rad`: there the face lies before x = 0.
+        let beyond = |p: &Point3<f64>| -p.x * cut_rad.cos() - along(p) * cut_rad.sin();
+        let [_, face, _] = counts(&scan, beyond);
+        assert!(face > 300, "{face}");
+        let least = scan.points.iter().map(|p| p.x).fold(f64::INFINITY, f64::min);
+        assert!((least + 10.0 * cut_rad.tan()).abs() < 0.2, "{least}");
+    }
+
+    #[test]
+    fn a_burr_stands_out_by_its_height_where_it_is_and_nowhere_else() {
+        let burr = Burr { height_mm: 0.3, from_rad: 1.0, over_rad: 1.2 };
+        let scan = seen(EndShape { burr: Some(burr), ..EndShape::default() });
+        let around = |p: &Point3<f64>| p.z.atan2(p.y).rem_euclid(TAU);
+        let (mut along, mut out) = (0f64, 0f64);
+        for p in &scan.points {
+            let (before, outside) = (-p.x, p.y.hypot(p.z) - 10.0);
+            if before > 1e-6 || outside > 1e-6 {
+                assert!((1.0..2.2).contains(&around(p)), "{p}");
+            }
+            (along, out) = (along.max(before), out.max(outside));
+        }
+        assert!((0.1..=0.3).contains(&along) && (0.1..=0.3).contains(&out), "{along} {out}");
+    }
+}
