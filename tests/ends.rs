@@ -1,5 +1,7 @@
 //! The ends of simulated tubes, measured by the whole reconstruction: how far off, and how honest about it.
 
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
 use benderd::reconstruct::{Options, Reconstruction, reconstruct};
 use benderd::sim::scan::{Burr, Density, EndShape, ScanSettings, SimulatedScan, TubeShape, scan};
 use benderd::tube::{Bend, Lra};

@@ -20,7 +20,7 @@ const LEAST_AGREEING: f64 = 0.6;
 /// the face's rim would pile up.
 const OUTSIDE_SIGMAS: std::ops::Range<f64> = -1.0..3.5;
 /// An outline is no sharper than this share of the noise: the rim of a face that does not show by itself blurs it.
-const RIM_SIGMAS: f64 = 0.4;
+const RIM_SIGMAS: f64 = 0.3;
 /// What differs by more than this many standard deviations is not the same.
 const DIFFERENT_SIGMAS: f64 = 4.0;
 

@@ -30,7 +30,7 @@ const LOOSE_SPREAD: f64 = 1.0;
 const CUTS: usize = 96;
 
 /// What the cuts teach is uncertain as if from this many layers of points less.
-const LEARNING: f64 = 6.0;
+const LEARNING: f64 = 5.0;
 
 /// Cut-off of the biweight over sectors, in standard deviations of one sector.
 const CUTOFF_SECTORS: f64 = 5.0;
