@@ -60,6 +60,16 @@ pub fn table(tube: &MeasuredTube) -> String {
         );
     }
     out += &format!(" end {}\n", cell(tube.last_length_mm, tube.last_length_sigma_mm));
+    let cuts = [
+        ("first", tube.first_cut_rad, tube.first_cut_sigma_rad),
+        ("last", tube.last_cut_rad, tube.last_cut_sigma_rad),
+    ];
+    for (which, cut, sigma) in cuts {
+        if let (Some(cut), Some(sigma)) = (cut, sigma) {
+            let (cut, sigma) = (cut.to_degrees(), sigma.to_degrees());
+            out += &format!("{which} end cut {cut:.2} ±{sigma:.2} degrees from square\n");
+        }
+    }
     tube.warnings.iter().for_each(|w| out += &format!("warning: {w}\n"));
     out
 }

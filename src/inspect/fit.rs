@@ -169,18 +169,10 @@ fn as_measured(lra: &Lra) -> MeasuredTube {
         radius_sigma_mm: None,
     };
     MeasuredTube {
-        tube_radius_mm: 0.0,
-        points_total: 0,
-        points_used: 0,
-        residual_median_mm: 0.0,
-        elapsed_ms: 0.0,
-        scan_sha256: String::new(),
-        last_length_mm: Some(lra.last_length_mm),
         last_length_sigma_mm: Some(0.1),
         bends: lra.bends.iter().map(bend).collect(),
         intersection_mm: Vec::new(),
         intersection_sigma_mm: Vec::new(),
-        reversed: None,
-        warnings: Vec::new(),
+        ..MeasuredTube::exact(lra, 0.0)
     }
 }

@@ -13,13 +13,17 @@ const MAX_LENGTH_SIGMA_MM: f64 = 5.0;
 const MAX_ROTATION_SIGMA_RAD: f64 = 45.0 * std::f64::consts::PI / 180.0;
 const MAX_RADIUS_SIGMA_SHARE: f64 = 0.5;
 
-/// How far from an end its points are looked at, in tube radii.
-const END_RADII: f64 = 2.0;
-
 /// Both ends found on the scan, in space.
 struct Ends {
     first: Option<(Point3<f64>, f64)>,
     last: Option<(Point3<f64>, f64)>,
+}
+
+/// What was scanned of the ends; None where there was too little.
+struct Scanned {
+    ends: Ends,
+    first: Option<End>,
+    last: Option<End>,
 }
 
 /// All values of the tube as functions of its parameters, with the ends fixed in space.
@@ -34,15 +38,16 @@ struct Values {
 
 /// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values.
 pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
-    let ends = set_ends(fit, sample);
+    let Scanned { ends, first, last } = set_ends(fit, sample);
+    let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
     let jacobian = jacobian(&fit.model, &fit.parameters, &ends);
     let covariance = &jacobian * &fit.covariance * jacobian.transpose();
     let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
-    let mut report = Report { sigma: at.like(sigmas), at, ends, warnings: Vec::new() };
+    let mut report = Report { sigma: at.like(sigmas), at, ends, first, last, warnings: Vec::new() };
     let n = fit.model.lra.bends.len();
     let bends = (0..n).map(|i| report.bend(i)).collect();
-    let last = report.length(n);
+    let last_length = report.length(n);
     let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
     MeasuredTube {
         tube_radius_mm: report.at.tube_radius[0],
@@ -51,13 +56,25 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
         residual_median_mm: 0.0,
         elapsed_ms: 0.0,
         scan_sha256: String::new(),
-        last_length_mm: last.map(|l| l.0),
-        last_length_sigma_mm: last.map(|l| l.1),
+        last_length_mm: last_length.map(|l| l.0),
+        last_length_sigma_mm: last_length.map(|l| l.1),
         bends,
         intersection_mm: corners.iter().map(|c| c.map(|c| c.0)).collect(),
         intersection_sigma_mm: corners.iter().map(|c| c.map(|c| c.1)).collect(),
+        first_cut_rad: first_cut.map(|c| c.0),
+        first_cut_sigma_rad: first_cut.map(|c| c.1),
+        last_cut_rad: last_cut.map(|c| c.0),
+        last_cut_sigma_rad: last_cut.map(|c| c.1),
         reversed: None,
         warnings: report.warnings,
+    }
+}
+
+/// Angle of the cut from square with its sigma, where it was seen.
+fn cut(end: Option<End>) -> Option<(f64, f64)> {
+    match end {
+        Some(End::Found(place)) => place.cut_rad,
+        _ => None,
     }
 }
 
@@ -66,6 +83,8 @@ struct Report {
     at: Values,
     sigma: Values,
     ends: Ends,
+    first: Option<End>,
+    last: Option<End>,
     warnings: Vec<String>,
 }
 
@@ -94,6 +113,24 @@ impl Report {
         Some(first_sigma.hypot(last_sigma))
     }
 
+    /// Why an end of leg `i` has no place.
+    fn why_no_end(&self, i: usize) -> String {
+        let end = if i == 0 && self.ends.first.is_none() { self.first } else { self.last };
+        let least = self.at.lengths[i];
+        match end {
+            Some(End::CutOff { slope_rad, .. }) => format!(
+                "the scan stops before the tube does ({:.0} degrees from square, no saw cuts so); at least {least:.1} mm",
+                slope_rad.to_degrees()
+            ),
+            Some(End::Ragged { .. }) => {
+                format!(
+                    "the points stop here and there, about {least:.1} mm from the bend; scan past that end"
+                )
+            }
+            _ => "that end of the tube was not scanned".to_owned(),
+        }
+    }
+
     /// Straight `i` with its sigma.
     fn length(&mut self, i: usize) -> Option<(f64, f64)> {
         let what = if i + 1 == self.at.lengths.len() {
@@ -102,7 +139,8 @@ impl Report {
             format!("the length before bend {}", i + 1)
         };
         let Some(end) = self.end_sigma(i) else {
-            self.warnings.push(format!("{what} is not known: that end of the tube was not scanned"));
+            let why = self.why_no_end(i);
+            self.warnings.push(format!("{what} is not known: {why}"));
             return None;
         };
         let sigma = self.sigma.lengths[i].hypot(end);
@@ -154,43 +192,41 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Ends {
-    let residuals = sample.residuals(&fit.model);
+fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
+    sample.residuals(&fit.model);
     let spine = fit.model.spine();
-    let last = spine.segments().len() - 1;
-    let reach = END_RADII * fit.model.tube_radius_mm;
-    let look = |segment: usize, frame: &Frame| -> Option<End> {
+    let last_segment = spine.segments().len() - 1;
+    let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
+    let look = |segment: usize, frame: &Frame, length_mm: f64| -> Option<End> {
         let inverse = frame.inverse();
-        let mine = sample.points.iter().zip(sample.segments()).zip(&residuals);
-        let points: Vec<Point3<f64>> = mine
-            .filter(|((_, s), r)| **s as usize == segment && r.abs() < fit.cutoff_mm)
-            .map(|((p, _), _)| inverse * p)
-            .collect();
-        ends::find(&points, reach)
+        let mine = sample.points.iter().zip(sample.segments()).filter(|(_, s)| **s as usize == segment);
+        let points: Vec<Point3<f64>> = mine.map(|(p, _)| inverse * p).filter(|p| p.x <= length_mm).collect();
+        ends::find(&points, radius, noise)
     };
     // Both looked at along the way into the tube.
-    let first_frame = spine.segments()[0].start;
-    let end_frame = spine.frame_at(spine.length_mm());
+    let (first_segment, end_segment) = (&spine.segments()[0], &spine.segments()[last_segment]);
+    let first_frame = first_segment.start;
     let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
-    let last_frame = end_frame * back;
-    let (first, final_end) = (look(0, &first_frame), look(last, &last_frame));
-    // The noise moves the outermost points along the tube too.
-    let noise_mm = fit.sigma_mm;
+    let last_frame = spine.frame_at(spine.length_mm()) * back;
+    let first = look(0, &first_frame, first_segment.length_mm);
+    let last = look(last_segment, &last_frame, end_segment.length_mm);
     let model = &mut fit.model;
-    if let Some(end) = final_end {
-        model.lra.last_length_mm -= end.at_mm;
+    if let Some(end) = last {
+        model.lra.last_length_mm -= end.at_mm();
     }
     if let Some(end) = first {
-        model.start *= Frame::translation(end.at_mm, 0.0, 0.0);
+        model.start *= Frame::translation(end.at_mm(), 0.0, 0.0);
         match model.lra.bends.first_mut() {
-            Some(bend) => bend.length_mm -= end.at_mm,
-            None => model.lra.last_length_mm -= end.at_mm,
+            Some(bend) => bend.length_mm -= end.at_mm(),
+            None => model.lra.last_length_mm -= end.at_mm(),
         }
     }
-    let place = |frame: &Frame, end: Option<End>| {
-        end.map(|e| (frame * Point3::new(e.at_mm, 0.0, 0.0), e.sigma_mm.hypot(noise_mm)))
+    let place = |frame: &Frame, end: Option<End>| match end {
+        Some(End::Found(e)) => Some((frame * Point3::new(e.at_mm, 0.0, 0.0), e.sigma_mm)),
+        _ => None,
     };
-    Ends { first: place(&first_frame, first), last: place(&last_frame, final_end) }
+    let ends = Ends { first: place(&first_frame, first), last: place(&last_frame, last) };
+    Scanned { ends, first, last }
 }
 
 fn values(model: &TubeModel, ends: &Ends) -> Values {

@@ -46,7 +46,7 @@ pub fn random_tube(seed: u64) -> Specimen {
     let points = (2.0 * radius_mm * lra.developed_length_mm() / (spacing_mm * spacing_mm)) as usize;
     let density = Density::Points(points.clamp(3_000, 60_000));
     let settings = ScanSettings { density, sight: Some(sight), ..ScanSettings::default() };
-    Specimen { shape: TubeShape { lra, od_mm: 2.0 * radius_mm, ovality }, settings, common_clr }
+    Specimen { shape: TubeShape { ovality, ..TubeShape::round(lra, 2.0 * radius_mm) }, settings, common_clr }
 }
 
 fn log_uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {

@@ -68,6 +68,34 @@ pub struct MeasuredTube {
     /// Their sigmas.
     #[serde(default)]
     pub intersection_sigma_mm: Vec<Option<f64>>,
+    /// Angle of the first end's face from square, where the scan shows it. An obliquely cut tube's length is measured
+    /// on its axis.
+    #[serde(
+        rename = "first_cut_deg",
+        with = "deg::option",
+        default,
+        skip_serializing_if = "Option::is_none"
+    )]
+    pub first_cut_rad: Option<f64>,
+    /// Its sigma.
+    #[serde(
+        rename = "first_cut_sigma_deg",
+        with = "deg::option",
+        default,
+        skip_serializing_if = "Option::is_none"
+    )]
+    pub first_cut_sigma_rad: Option<f64>,
+    /// The same of the last end.
+    #[serde(rename = "last_cut_deg", with = "deg::option", default, skip_serializing_if = "Option::is_none")]
+    pub last_cut_rad: Option<f64>,
+    /// Its sigma.
+    #[serde(
+        rename = "last_cut_sigma_deg",
+        with = "deg::option",
+        default,
+        skip_serializing_if = "Option::is_none"
+    )]
+    pub last_cut_sigma_rad: Option<f64>,
     /// With a nominal: whether the scan was turned round to its direction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reversed: Option<bool>,
@@ -105,6 +133,10 @@ impl MeasuredTube {
             bends: lra.bends.iter().map(bend).collect(),
             intersection_sigma_mm: corners.iter().map(|c| c.map(|_| 0.0)).collect(),
             intersection_mm: corners,
+            first_cut_rad: None,
+            first_cut_sigma_rad: None,
+            last_cut_rad: None,
+            last_cut_sigma_rad: None,
             reversed: None,
             warnings: Vec::new(),
         }
@@ -157,6 +189,8 @@ impl MeasuredTube {
         }
         out.intersection_mm.reverse();
         out.intersection_sigma_mm.reverse();
+        (out.first_cut_rad, out.first_cut_sigma_rad) = (self.last_cut_rad, self.last_cut_sigma_rad);
+        (out.last_cut_rad, out.last_cut_sigma_rad) = (self.first_cut_rad, self.first_cut_sigma_rad);
         out
     }
 }

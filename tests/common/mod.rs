@@ -22,18 +22,14 @@ pub fn measured(lra: &Lra, angle_sigma_deg: f64) -> MeasuredTube {
     };
     let intersection_mm = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
     MeasuredTube {
-        tube_radius_mm: 12.7,
         points_total: 200_000,
         points_used: 190_000,
         residual_median_mm: 0.03,
         elapsed_ms: 200.0,
-        scan_sha256: String::new(),
-        last_length_mm: Some(lra.last_length_mm),
         last_length_sigma_mm: Some(0.03),
         bends: lra.bends.iter().enumerate().map(bend).collect(),
         intersection_sigma_mm: intersection_mm.iter().map(|d| d.map(|_| 0.02)).collect(),
         intersection_mm,
-        reversed: None,
-        warnings: Vec::new(),
+        ..MeasuredTube::exact(lra, 12.7)
     }
 }
