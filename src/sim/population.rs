@@ -49,6 +49,28 @@ pub fn random_tube(seed: u64) -> Specimen {
     Specimen { shape: TubeShape { lra, od_mm: 2.0 * radius_mm, ovality }, settings, common_clr }
 }
 
+/// The tube of paper 000's Results (section 8), as far as it is described there: radius 4 mm, 268 mm long, 5 bends, 6005
+/// points.
+pub fn papers_tube() -> Specimen {
+    let bend = |length_mm, rotation_deg: f64, angle_deg: f64| Bend {
+        length_mm,
+        rotation_rad: rotation_deg.to_radians(),
+        angle_rad: angle_deg.to_radians(),
+        radius_mm: 15.0,
+    };
+    let bends = vec![
+        bend(30.0, 0.0, 60.0),
+        bend(25.0, 90.0, 45.0),
+        bend(30.0, -60.0, 4.0),
+        bend(25.0, 120.0, 90.0),
+        bend(20.0, 180.0, 70.0),
+    ];
+    let mut lra = Lra { bends, last_length_mm: 0.0 };
+    lra.last_length_mm = 268.0 - lra.developed_length_mm();
+    let settings = ScanSettings { density: Density::Points(6005), ..ScanSettings::default() };
+    Specimen { shape: TubeShape::round(lra, 8.0), settings, common_clr: true }
+}
+
 fn log_uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
     rng.random_range(low.ln()..high.ln()).exp()
 }
