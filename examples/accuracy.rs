@@ -1,5 +1,5 @@
 //! How right and how accurate the reconstruction is on simulated scans: a row per case, totals, targets.
-//! `cargo run --release --example accuracy -- thirty|paper [--seed FIRST] [--count M] [--markdown]`; exit status 0 when
+//! `cargo run --release --example accuracy -- thirty|hard|paper [--seed FIRST] [--count M] [--markdown]`; exit status 0 when
 //! the targets of the set are met, 1 when not.
 
 #![allow(clippy::print_stdout)] // an example prints
@@ -13,7 +13,7 @@ use benderd::trial::accuracy::{Set, Tally, heading, markdown, row, run, totals};
 
 #[derive(Debug, Parser)]
 struct Args {
-    /// thirty (like the benchmark of paper 000) or paper (its one example).
+    /// thirty (like the benchmark of paper 000), hard (scans spoiled in every way) or paper (its one example).
     set: Set,
     /// Seed of the first case.
     #[arg(long, default_value_t = 0)]

@@ -142,6 +142,11 @@ pub fn judge(
     let measured = if backwards { backward } else { forward };
     let mut values = row_values(measured, &shape.lra, &bound);
     values.extend(straight_values(measured, &shape.lra, &bound));
+    if let Some(end) = settings.unseen_end {
+        // A straight that was scanned in part looks like one that was cut there: no data could tell.
+        let row = if end.last { bends + 1 } else { 1 };
+        values.retain(|v| v.row != row || !matches!(v.kind, Kind::EndLength | Kind::EndIntersection));
+    }
     values.push(Value {
         kind: Kind::TubeRadius,
         row: 1,

@@ -60,6 +60,7 @@ fn targets_are_missed_by_the_case() {
         bends: 1,
         round: true,
         points: 100,
+        nuisances: String::new(),
         elapsed_ms: 1.0,
         judgement: Judgement { verdict, values: vec![value(Kind::Angle, 0.1, 0.1)] },
     };

@@ -30,9 +30,9 @@ pub fn row(case: &Case) -> String {
         format!("{largest:>14.4} {over:>5}")
     };
     let cells = if values.is_empty() { String::new() } else { IN_ROW.iter().map(cell).collect() };
-    let Case { seed, tube_radius_mm, bends, points, elapsed_ms, .. } = case;
+    let Case { seed, tube_radius_mm, bends, points, elapsed_ms, nuisances, .. } = case;
     format!(
-        "{seed:>5} {tube_radius_mm:>7.2} {bends:>5} {points:>8} {elapsed_ms:>7.0}  {cells}{}",
+        "{seed:>5} {tube_radius_mm:>7.2} {bends:>5} {points:>8} {elapsed_ms:>7.0}  {cells}  {nuisances}{}",
         remark(case)
     )
 }
