@@ -195,7 +195,7 @@ fn the_chain_from_cloud_to_table_converges() {
             let table = step(&nominal, &history, &Knowledge::default(), &limits).commanded;
             let formed = plant.bend(&table, nominal.lra.developed_length_mm());
             let (good, angle, point) = truth(&formed.lra, &nominal);
-            let shape = TubeShape { lra: formed.lra, od_mm: nominal.od_mm, ovality: formed.ovality };
+            let shape = TubeShape { ovality: formed.ovality, ..TubeShape::round(formed.lra, nominal.od_mm) };
             let settings =
                 ScanSettings { density: Density::Points(30_000), views: 2, ..ScanSettings::default() };
             let cloud = scan::scan(&shape, &settings, 100 * seed + part).cloud();

@@ -84,7 +84,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
     let part = load_part(&args.part, &Materials::shipped()?)?;
     let ovality = vec![args.ovality; part.lra.bends.len()];
-    let shape = TubeShape { lra: part.lra, od_mm: part.od_mm, ovality };
+    let shape = TubeShape { ovality, ..TubeShape::round(part.lra, part.od_mm) };
     let settings = ScanSettings {
         density: Density::Points(args.points as usize),
         views: args.views.into(),

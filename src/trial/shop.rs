@@ -74,8 +74,10 @@ impl Shop {
     pub async fn scan(&mut self, tube: &FormedTube) -> Result<(), TrialError> {
         self.scans += 1;
         self.scan_seed = self.scan_seed.wrapping_add(1);
-        let shape =
-            TubeShape { lra: tube.lra.clone(), od_mm: self.nominal.od_mm, ovality: tube.ovality.clone() };
+        let shape = TubeShape {
+            ovality: tube.ovality.clone(),
+            ..TubeShape::round(tube.lra.clone(), self.nominal.od_mm)
+        };
         let (seed, folder) = (self.scan_seed, self.scan_folder.clone());
         let name = format!("scan-{:02}.ply", self.scans);
         let write = move || -> Result<(), TrialError> {

@@ -6,6 +6,7 @@
 //! points, patches without data, passes that disagree, a tube that was not scanned to its end; `props` a table,
 //! V-blocks and clamp jaws. Shares no code with the estimators.
 
+mod end;
 mod props;
 mod solid;
 mod sweep;
@@ -23,6 +24,7 @@ use rand_distr::StandardNormal;
 use crate::cloud::PointCloud;
 use crate::tube::{Frame, Lra, Spine};
 
+pub use end::{Burr, EndShape};
 use props::Prop;
 use solid::Solid;
 
@@ -36,12 +38,17 @@ pub struct TubeShape {
     /// Per bend, (largest - smallest diameter) / nominal diameter: 0 is round, missing ones are 0. The tube flattens
     /// in the plane of the bend.
     pub ovality: Vec<f64>,
+    /// Thickness of the wall: light returns from the end faces and from the bore close to them. 0 is a tube whose open
+    /// ends return nothing.
+    pub wall_mm: f64,
+    /// How the first and the last end were cut.
+    pub ends: [EndShape; 2],
 }
 
 impl TubeShape {
-    /// A tube with round sections throughout.
+    /// A tube with round sections throughout and clean, square, dark ends.
     pub fn round(lra: Lra, od_mm: f64) -> TubeShape {
-        TubeShape { lra, od_mm, ovality: Vec::new() }
+        TubeShape { lra, od_mm, ovality: Vec::new(), wall_mm: 0.0, ends: [EndShape::default(); 2] }
     }
 }
 

@@ -2,19 +2,23 @@
 //!
 //! The surface is where the distance to the centre line equals the section's radius. A ray advances by that
 //! distance (it cannot pass the surface) until it is close, then Newton's method finds the root. In a bend the
-//! section is an ellipse flattened in the bend's plane, growing out of the circle within a radius of arc.
+//! section is an ellipse flattened in the bend's plane, growing out of the circle within a radius of arc. Both ends are
+//! clipped (`end`); with a wall the tube is hollow, and light returns from the faces and from the bore close to them.
 
 use std::f64::consts::PI;
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::TubeShape;
+use super::end::Cut;
 use crate::tube::{SegmentKind, Spine};
 
 /// Closer than this share of the radius, the root is sought by Newton's method.
 const NEAR: f64 = 1e-3;
 /// Cosine of incidence below which a ray only skims the surface (86 degrees).
 const SKIMMING: f64 = 0.07;
+/// The scanner's camera sees this deep into the bore, in tube radii.
+const BORE_RADII: f64 = 1.0;
 /// A ray still creeping after this many steps skims a surface.
 const MOST_STEPS: usize = 300;
 
@@ -37,9 +41,9 @@ impl Ray {
 pub(super) enum Cast {
     /// Nothing up to the limit.
     Miss,
-    /// The tube, but where no light returns: its open end, or a skimmed side.
+    /// The tube, but where no light returns: its open end, deep in the bore, or a skimmed side.
     Blocked(f64),
-    /// The outside at this distance, with the cosine of incidence.
+    /// A surface at this distance, with the cosine of incidence.
     Outside { t: f64, cosine: f64 },
 }
 
@@ -70,25 +74,29 @@ pub(super) struct Chunk {
     pub piece: usize,
 }
 
-/// An open end.
-#[derive(Debug, Clone, Copy)]
-struct End {
-    centre: Point3<f64>,
-    outward: Vector3<f64>,
+/// What a point is nearest to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Surface {
+    Outside,
+    Face,
+    Bore,
 }
 
-/// Distance from the surface, below 0 inside; and the end whose face the point lies beyond.
+/// Distance from the surface, below 0 in the material; the share of it that is safe to advance.
 struct Near {
     distance_mm: f64,
-    beyond: Option<usize>,
+    stride: f64,
+    surface: Surface,
 }
 
 /// The tube.
 #[derive(Debug)]
 pub(super) struct Solid {
     pieces: Vec<Piece>,
-    ends: [End; 2],
+    ends: [Cut; 2],
     radius_mm: f64,
+    /// Thickness of the wall; 0 for an end that returns nothing.
+    wall_mm: f64,
     /// Share of the distance that is safe to advance: an oval section's field is a little steeper than 1.
     stride: f64,
 }
@@ -112,16 +120,24 @@ impl Solid {
                 pieces.push(Piece { origin, to_local, length_mm: segment.length_mm, arc });
             }
         }
-        let end = |at: f64, sign: f64| {
-            let frame = spine.frame_at(at);
-            let outward = frame.rotation * (Vector3::x() * sign);
-            End { centre: frame.translation.vector.into(), outward }
+        let end = |at: f64, sign: f64, k: usize| {
+            Cut::new(&spine.frame_at(at), sign, shape.od_mm / 2.0, shape.ends[k])
         };
+        let ends = [end(0.0, -1.0, 0), end(spine.length_mm(), 1.0, 1)];
+        if let Some(first) = pieces.first_mut().filter(|p| p.arc.is_none()) {
+            let more = ends[0].overhang_mm();
+            first.origin -= first.to_local.row(0).transpose() * more;
+            first.length_mm += more;
+        }
+        if let Some(last) = pieces.last_mut().filter(|p| p.arc.is_none()) {
+            last.length_mm += ends[1].overhang_mm();
+        }
         let steepest = shape.ovality.iter().fold(0.0, |a: f64, b| a.max(b.abs()));
         Solid {
             pieces,
-            ends: [end(0.0, -1.0), end(spine.length_mm(), 1.0)],
+            ends,
             radius_mm: shape.od_mm / 2.0,
+            wall_mm: shape.wall_mm,
             stride: 1.0 / (1.0 + 2.0 * steepest),
         }
     }
@@ -135,17 +151,18 @@ impl Solid {
     pub fn chunks(&self, spine: &Spine) -> Vec<Chunk> {
         let mut chunks = Vec::new();
         let bent = spine.segments().iter().filter(|s| s.length_mm > 0.0);
-        for (piece, segment) in bent.enumerate() {
-            let n = (segment.length_mm / (2.0 * self.radius_mm)).ceil().clamp(1.0, 1e6) as usize;
-            let step = segment.length_mm / n as f64;
-            let half =
-                step / 2.0 * self.pieces[piece].arc.map_or(1.0, |a| 1.0 + self.radius_mm / a.radius_mm);
+        for (index, (segment, piece)) in bent.zip(&self.pieces).enumerate() {
+            let n = (piece.length_mm / (2.0 * self.radius_mm)).ceil().clamp(1.0, 1e6) as usize;
+            let step = piece.length_mm / n as f64;
+            let half = step / 2.0 * piece.arc.map_or(1.0, |a| 1.0 + self.radius_mm / a.radius_mm);
+            // The first straight goes on before its segment.
+            let before = if index == 0 && piece.arc.is_none() { self.ends[0].overhang_mm() } else { 0.0 };
             for k in 0..n {
-                let middle = segment.frame_at(step * (k as f64 + 0.5));
+                let middle = segment.frame_at(step * (k as f64 + 0.5) - before);
                 let centre = middle.translation.vector.into();
                 // The corners are farthest: in a bend, those on its outside.
                 let radius_mm = 1.1 * (self.radius_mm / self.stride).hypot(half);
-                chunks.push(Chunk { centre, radius_mm, piece });
+                chunks.push(Chunk { centre, radius_mm, piece: index });
             }
         }
         chunks
@@ -156,31 +173,19 @@ impl Solid {
         let mut t = 0.0;
         for _ in 0..MOST_STEPS {
             let near = self.near(&ray.at(t), pieces);
-            if near.distance_mm > NEAR * self.radius_mm {
-                t += near.distance_mm * self.stride;
-                if t > limit_mm {
-                    return Cast::Miss;
-                }
-                continue;
+            if near.distance_mm <= NEAR * self.radius_mm {
+                return self.settle(ray, t, pieces);
             }
-            let found = match near.beyond {
-                Some(end) => Err((t, end)),
-                None => self.settle(ray, t, pieces),
-            };
-            match found {
-                Ok(cast) => return cast,
-                Err((at, end)) => match self.past_end(ray, at, end) {
-                    Some(exit) => t = exit,
-                    None => return Cast::Blocked(at),
-                },
+            t += near.distance_mm * near.stride;
+            if t > limit_mm {
+                return Cast::Miss;
             }
         }
         Cast::Blocked(t)
     }
 
-    /// Newton's method from close by. Err with the place and the end when the root is no surface but the ball
-    /// about an end.
-    fn settle(&self, ray: &Ray, from: f64, pieces: &[usize]) -> Result<Cast, (f64, usize)> {
+    /// Newton's method from close by.
+    fn settle(&self, ray: &Ray, from: f64, pieces: &[usize]) -> Cast {
         let mut t = from;
         let h = 1e-5 * self.radius_mm;
         for _ in 0..20 {
@@ -193,45 +198,58 @@ impl Solid {
             let step = here.distance_mm / slope;
             t -= step;
             if step.abs() < 1e-10 * self.radius_mm {
-                return match here.beyond {
-                    Some(end) => Err((t, end)),
-                    None => Ok(Cast::Outside { t, cosine: (-slope).min(1.0) }),
+                let lit = match here.surface {
+                    Surface::Outside => true,
+                    Surface::Face => self.wall_mm > 0.0,
+                    Surface::Bore => self.near_an_end(&ray.at(t)),
                 };
+                return if lit { Cast::Outside { t, cosine: (-slope).min(1.0) } } else { Cast::Blocked(t) };
             }
         }
-        Ok(Cast::Blocked(t))
+        Cast::Blocked(t)
     }
 
-    /// A ray in the ball about an end, beyond its face: where it leaves the ball, or None when it has gone
-    /// through the face into the tube by then.
-    fn past_end(&self, ray: &Ray, t: f64, end: usize) -> Option<f64> {
-        let end = &self.ends[end];
-        let to = ray.at(t) - end.centre;
-        let along = to.dot(&ray.direction);
-        // Out of reach of NEAR, so that the march goes on.
-        let out = self.radius_mm * (1.0 + 2.0 * NEAR);
-        let exit = t - along + (along * along - to.norm_squared() + out * out).max(0.0).sqrt();
-        ((ray.at(exit) - end.centre).dot(&end.outward) > 0.0).then_some(exit)
+    /// Whether the scanner sees a place in the bore.
+    fn near_an_end(&self, p: &Point3<f64>) -> bool {
+        let reach = self.radius_mm.hypot(BORE_RADII * self.radius_mm);
+        self.ends
+            .iter()
+            .any(|end| -end.beyond_mm(p) < BORE_RADII * self.radius_mm && (p - end.centre).norm() < reach)
     }
 
     fn near(&self, p: &Point3<f64>, pieces: &[usize]) -> Near {
-        let mut best = Near { distance_mm: f64::INFINITY, beyond: None };
+        let mut best = Near { distance_mm: f64::INFINITY, stride: self.stride, surface: Surface::Outside };
+        let mut outside_mm = f64::INFINITY;
         for &i in pieces {
-            let (distance_mm, side) = self.pieces[i].distance(p, self.radius_mm);
-            if distance_mm < best.distance_mm {
-                let beyond = match side {
-                    Side::Before if i == 0 => Some(0),
-                    Side::After if i + 1 == self.pieces.len() => Some(1),
-                    _ => None,
-                };
-                best = Near { distance_mm, beyond };
+            let (lateral_mm, side) = self.pieces[i].distance(p, self.radius_mm);
+            outside_mm = outside_mm.min(lateral_mm);
+            let mut near = Near { distance_mm: lateral_mm, stride: self.stride, surface: Surface::Outside };
+            let line = self.pieces[i].arc.is_none();
+            let first = i == 0 && (line || side == Side::Before);
+            let last = i + 1 == self.pieces.len() && (line || side == Side::After);
+            for (end, _) in self.ends.iter().zip([first, last]).filter(|(_, own)| *own) {
+                let clipped = end.clip(p, near.distance_mm);
+                if clipped.face {
+                    near.surface = Surface::Face;
+                }
+                near.distance_mm = clipped.distance_mm;
+                near.stride = near.stride.min(clipped.stride);
             }
+            if near.distance_mm < best.distance_mm {
+                best = near;
+            }
+        }
+        // The bore is taken out of the whole tube, so that no piece closes its neighbour's.
+        let within_mm = -self.wall_mm - outside_mm;
+        if self.wall_mm > 0.0 && within_mm > best.distance_mm {
+            best = Near { distance_mm: within_mm, stride: self.stride, surface: Surface::Bore };
         }
         best
     }
 }
 
 /// Where a point's foot lies on a piece.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Side {
     Before,
     Within,

@@ -1,5 +1,7 @@
 //! One reconstruction against its truth: the error of every value beside its reported sigma and its bound.
 
+use nalgebra::Point3;
+
 use crate::reconstruct::Reconstruction;
 use crate::reconstruct::bound::{Bound, cramer_rao};
 use crate::reconstruct::model::TubeModel;
@@ -135,8 +137,7 @@ pub fn judge(
     let radii = || found.lra.bends.iter().map(|b| b.radius_mm);
     let common_radius = radii().zip(radii().skip(1)).all(|(a, b)| a == b);
     let truth = true_model(shape, scanned, common_radius);
-    let own = scanned.points.iter().zip(&scanned.kinds).filter(|(_, kind)| **kind == PointKind::Tube);
-    let bound = cramer_rao(&truth, own.map(|(p, _)| *p).collect(), settings.noise_mm);
+    let bound = cramer_rao(&truth, outside(shape, scanned), settings.noise_mm);
     let (forward, backward) = (&found.measured, &found.measured.reversed());
     let backwards = misfit(backward, shape) < misfit(forward, shape);
     let measured = if backwards { backward } else { forward };
@@ -168,6 +169,14 @@ fn true_model(shape: &TubeShape, scanned: &SimulatedScan, common_radius: bool) -
     let ovality_mm = (0..lra.bends.len()).map(oval).collect();
     let start = scanned.spine.segments()[0].start;
     TubeModel { common_radius, ovality_mm, ..TubeModel::round(start, lra, radius) }
+}
+
+/// The scanned points of the tube's outside: those of the bore say nothing of it.
+fn outside(shape: &TubeShape, scanned: &SimulatedScan) -> Vec<Point3<f64>> {
+    let least_mm = (shape.od_mm - shape.wall_mm) / 2.0;
+    let outside = |p: &Point3<f64>| shape.wall_mm == 0.0 || scanned.spine.closest(p).distance_mm > least_mm;
+    let own = scanned.points.iter().zip(&scanned.kinds).filter(|(_, kind)| **kind == PointKind::Tube);
+    own.map(|(p, _)| *p).filter(outside).collect()
 }
 
 /// How badly a measurement fits a tube in this direction; each value counts at most once, however far off it is.

@@ -23,7 +23,7 @@ use super::TrialError;
 use crate::cloud::{PointCloud, Unit, read_scan};
 use crate::reconstruct::{Options, Reconstruction, reconstruct};
 use crate::sim::population::{Scene, papers_tube, random_scene, random_tube};
-use crate::sim::scan::{ScanSettings, UnseenEnd, scan};
+use crate::sim::scan::{ScanSettings, TubeShape, UnseenEnd, scan};
 use crate::sim::scan_file::ScanFile;
 
 pub use judge::{Judgement, Kind, Value, Verdict, judge, refused};
@@ -141,7 +141,7 @@ pub fn run(set: Set, seed: u64, folder: &Path) -> Result<Case, TrialError> {
         bends: shape.lra.bends.len(),
         round: shape.ovality.iter().all(|o| *o == 0.0),
         points: scanned.points.len(),
-        nuisances: nuisances(settings, file),
+        nuisances: nuisances(shape, settings, file),
         elapsed_ms,
         judgement,
     })
@@ -163,7 +163,7 @@ fn measure(cloud: &PointCloud) -> Result<Reconstruction, String> {
 }
 
 /// What spoils a scan, in a few words.
-fn nuisances(settings: &ScanSettings, file: Option<ScanFile>) -> String {
+fn nuisances(shape: &TubeShape, settings: &ScanSettings, file: Option<ScanFile>) -> String {
     let mut words = Vec::new();
     let mut add = |there: bool, word: String| words.extend(there.then_some(word));
     let (views, drift_um) = (settings.views, 1e3 * settings.pass_drift_mm);
@@ -177,6 +177,8 @@ fn nuisances(settings: &ScanSettings, file: Option<ScanFile>) -> String {
         let (which, tilt) = (if last { "last" } else { "first" }, tilt_rad.to_degrees());
         add(true, format!("{which} {unseen_mm:.0} mm unseen at {tilt:.0} deg"));
     }
+    add(shape.ends.iter().any(|e| e.cut_rad > 0.0), "oblique cut".to_owned());
+    add(shape.ends.iter().any(|e| e.burr.is_some()), "burr".to_owned());
     add(file.is_some(), file.map_or("", ScanFile::name).to_owned());
     words.join(", ")
 }
