@@ -107,7 +107,7 @@ fn ply_header(out: &mut impl Write, format: &str, scalar: &str, more: &str, n: u
     for axis in ["x", "y", "z"] {
         writeln!(out, "property {scalar} {axis}")?;
     }
-    write!(out, "{more}end_header\n")
+    writeln!(out, "{more}end_header")
 }
 
 fn text(out: &mut impl Write, points: &[Point3<f64>], between: &str, after: &str) -> io::Result<()> {

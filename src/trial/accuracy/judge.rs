@@ -218,7 +218,7 @@ fn straight_values(measured: &MeasuredTube, truth: &Lra, bound: &Bound) -> Vec<V
     let n = truth.bends.len();
     let corners = truth.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
     let mut values = Vec::new();
-    for i in 0..=n {
+    for (i, corner) in corners.iter().enumerate() {
         let (length, sigma, right) = match measured.bends.get(i) {
             Some(b) => (b.length_mm, b.length_sigma_mm, truth.bends[i].length_mm),
             None => (measured.last_length_mm, measured.last_length_sigma_mm, truth.last_length_mm),
@@ -231,7 +231,7 @@ fn straight_values(measured: &MeasuredTube, truth: &Lra, bound: &Bound) -> Vec<V
         let error = length.map(|l| l - right);
         let limit = |bound: f64| inner.then_some(bound);
         values.push(Value { kind, row: i + 1, error, sigma, bound: limit(bound.lengths_mm[i]) });
-        if let Some(right) = corners[i] {
+        if let Some(right) = corner {
             let given = |list: &[Option<f64>]| list.get(i).copied().flatten();
             values.push(Value {
                 kind: corner_kind,
