@@ -41,7 +41,7 @@ fn main() -> anyhow::Result<ExitCode> {
         }
         tally.cases.push(case);
     }
-    println!("{}", if args.markdown { markdown(&tally) } else { totals(&tally, args.set) });
+    println!("{}", if args.markdown { markdown(&tally, args.set) } else { totals(&tally, args.set) });
     let met = tally.misses(args.set).is_empty();
     Ok(if met { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

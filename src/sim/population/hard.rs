@@ -26,7 +26,7 @@ pub struct Scene {
 /// Points of the largest scans.
 const MOST_POINTS: f64 = 2e6;
 /// Around the tube come so many times its points from a table.
-const TABLE_SHARE: f64 = 2.0;
+const TABLE_SHARE: f64 = 3.0;
 /// The coarsest spacing of one pass, in tube radii.
 const COARSEST: f64 = 0.2;
 /// What is left of an end straight that was not scanned to its end, at least, in tube radii.
@@ -166,6 +166,8 @@ fn is_seen(tube: &Specimen, seed: u64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tube::Bend;
+    use nalgebra::Vector3;
 
     #[test]
     fn the_hard_population_is_as_described() {
@@ -212,5 +214,39 @@ mod tests {
         assert_eq!(random_scene(3), random_scene(3));
         assert_ne!(random_scene(3), random_scene(4));
         assert_ne!(random_scene(3).tube.shape.lra, random_tube(3).shape.lra);
+    }
+
+    /// A hairpin whose legs lie 100 mm apart in y, and a shallow bend after it.
+    fn hairpin(sight: Vector3<f64>) -> Specimen {
+        let bend = |length_mm, angle_rad| Bend { length_mm, rotation_rad: 0.0, angle_rad, radius_mm: 50.0 };
+        let lra = Lra { bends: vec![bend(200.0, PI), bend(100.0, 0.05)], last_length_mm: 80.0 };
+        let settings = ScanSettings { sight: Some(sight), ..ScanSettings::default() };
+        Specimen { shape: TubeShape::round(lra, 20.0), settings, common_clr: true }
+    }
+
+    #[test]
+    fn what_hides_a_part_of_the_tube_is_drawn_again() {
+        let broad = hairpin(Vector3::z());
+        assert!(is_seen(&broad, 1));
+        assert!(!is_seen(&hairpin(Vector3::y()), 1), "one leg behind the other");
+        let with = |settings: ScanSettings| Specimen { settings, ..broad.clone() };
+        let grip = ScanSettings { jaws: Some(Jaws::Grip), ..broad.settings.clone() };
+        assert!(is_seen(&with(grip), 1), "jaws leave a gap");
+        // An end that is meant to be unseen does not count as hidden, more than that does.
+        let end = |unseen_mm| {
+            let unseen_end = Some(UnseenEnd { last: true, unseen_mm, tilt_rad: 0.0 });
+            ScanSettings { unseen_end, ..broad.settings.clone() }
+        };
+        assert!(is_seen(&with(end(40.0)), 1));
+    }
+
+    #[test]
+    fn a_shallow_bend_stands_out_of_the_drift() {
+        let mut tube = hairpin(Vector3::z());
+        // 0.05 rad beside 80 mm: 1 mm.
+        for (drift, expected) in [(0.0, true), (0.499, true), (0.501, false)] {
+            tube.settings.pass_drift_mm = drift;
+            assert_eq!(stands_out(&tube), expected, "{drift}");
+        }
     }
 }

@@ -5,7 +5,7 @@ use nalgebra::Point3;
 use crate::reconstruct::Reconstruction;
 use crate::reconstruct::bound::{Bound, cramer_rao};
 use crate::reconstruct::model::TubeModel;
-use crate::sim::scan::{PointKind, ScanSettings, SimulatedScan, TubeShape};
+use crate::sim::scan::{PointKind, ScanSettings, SimulatedScan, TubeShape, UnseenEnd};
 use crate::tube::{Lra, MeasuredTube, wrap_angle};
 
 /// What a value is. Angles are in degrees here, as the trade speaks of them; the rest in millimetres.
@@ -144,9 +144,7 @@ pub fn judge(
     let mut values = row_values(measured, &shape.lra, &bound);
     values.extend(straight_values(measured, &shape.lra, &bound));
     if let Some(end) = settings.unseen_end {
-        // A straight that was scanned in part looks like one that was cut there: no data could tell.
-        let row = if end.last { bends + 1 } else { 1 };
-        values.retain(|v| v.row != row || !matches!(v.kind, Kind::EndLength | Kind::EndIntersection));
+        leave_out_unseen(&mut values, &end, bends);
     }
     values.push(Value {
         kind: Kind::TubeRadius,
@@ -211,6 +209,12 @@ fn row_values(measured: &MeasuredTube, truth: &Lra, bound: &Bound) -> Vec<Value>
         push(Kind::Clr, off, a.radius_sigma_mm, bound.radii_mm[i]);
     }
     values
+}
+
+/// A straight that was scanned in part looks like one that was cut there: no data could tell its length.
+pub(super) fn leave_out_unseen(values: &mut Vec<Value>, end: &UnseenEnd, bends: usize) {
+    let row = if end.last { bends + 1 } else { 1 };
+    values.retain(|v| v.row != row || !matches!(v.kind, Kind::EndLength | Kind::EndIntersection));
 }
 
 /// Lengths and intersection distances.

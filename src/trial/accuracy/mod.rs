@@ -46,16 +46,23 @@ impl FromStr for Set {
     type Err = String;
 
     fn from_str(word: &str) -> Result<Set, String> {
-        match word {
-            "thirty" => Ok(Set::Thirty),
-            "hard" => Ok(Set::Hard),
-            "paper" => Ok(Set::Paper),
-            _ => Err(format!("no set {word:?}: one of thirty, hard, paper")),
-        }
+        let known = || Set::ALL.map(Set::name).join(", ");
+        Set::ALL.into_iter().find(|s| s.name() == word).ok_or_else(|| format!("one of {}", known()))
     }
 }
 
 impl Set {
+    const ALL: [Set; 3] = [Set::Thirty, Set::Hard, Set::Paper];
+
+    /// Its name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Set::Thirty => "thirty",
+            Set::Hard => "hard",
+            Set::Paper => "paper",
+        }
+    }
+
     /// Cases that the target speaks of.
     pub fn usual_count(self) -> u64 {
         match self {

@@ -75,3 +75,29 @@ fn targets_are_missed_by_the_case() {
     tally.cases[3].judgement.values[0].error = Some(0.8);
     assert!(tally.misses(Set::Thirty)[0].starts_with("angle deg 1.7"), "{:?}", tally.misses(Set::Thirty));
 }
+
+#[test]
+fn an_end_that_was_not_scanned_is_not_asked_for() {
+    let two_bends = || -> Vec<Value> {
+        let rows =
+            [(Kind::EndLength, 1), (Kind::EndIntersection, 1), (Kind::Length, 2), (Kind::EndLength, 3)];
+        let rest = [(Kind::EndIntersection, 3), (Kind::Angle, 1), (Kind::Clr, 1)];
+        rows.into_iter().chain(rest).map(|(kind, row)| Value { row, ..value(kind, 9.0, 0.1) }).collect()
+    };
+    for (last, gone) in [(true, 3), (false, 1)] {
+        let mut values = two_bends();
+        let end = UnseenEnd { last, unseen_mm: 10.0, tilt_rad: 0.0 };
+        judge::leave_out_unseen(&mut values, &end, 2);
+        assert_eq!(values.len(), 5);
+        assert!(values.iter().all(|v| v.row != gone || matches!(v.kind, Kind::Angle | Kind::Clr)));
+    }
+}
+
+#[test]
+fn the_table_says_what_it_is_of() {
+    let case = run(Set::Paper, 4, Path::new(".")).unwrap();
+    let table = markdown(&Tally { cases: vec![case] }, Set::Paper);
+    assert!(table.starts_with("Set `paper`, seeds 4 to 4: 1 right of 1;"), "{table}");
+    assert_eq!(table.lines().filter(|l| l.starts_with('|')).count(), 2 + Kind::ALL.len());
+    assert!(Set::from_str("thirty") == Ok(Set::Thirty) && Set::from_str("soft").is_err());
+}

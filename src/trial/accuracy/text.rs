@@ -122,10 +122,13 @@ pub fn totals(tally: &Tally, set: Set) -> String {
     }
 }
 
-/// The totals as a markdown table, without times.
-pub fn markdown(tally: &Tally) -> String {
+/// The totals as a markdown table with a line above it, without times.
+pub fn markdown(tally: &Tally, set: Set) -> String {
+    let seed = |case: Option<&Case>| case.map_or(0, |c| c.seed);
+    let (first, last) = (seed(tally.cases.first()), seed(tally.cases.last()));
     let line = |cells: [String; 11]| format!("| {} |\n", cells.join(" | "));
-    let mut out = line(COLUMNS.map(str::to_owned)) + "|:--" + &"|--:".repeat(10) + "|\n";
+    let mut out = format!("Set `{}`, seeds {first} to {last}: {}.\n\n", set.name(), summary(tally));
+    out += &(line(COLUMNS.map(str::to_owned)) + "|:--" + &"|--:".repeat(10) + "|\n");
     Kind::ALL.iter().for_each(|k| out += &line(cells(tally, *k)));
-    format!("{out}\n{}", summary(tally))
+    out.trim_end().to_owned()
 }
