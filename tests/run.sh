@@ -89,6 +89,6 @@ if [ "${FULL:-0}" = 1 ]; then
     part deny deny
     part "many property cases" env PROPTEST_CASES=2000 cargo test --locked
     part "demo campaign" demo_campaign
-    part "thirty tubes" cargo run --locked --release --example thirty
+    part "thirty tubes" cargo run --locked --release --example accuracy -- thirty
 fi
 report 0

@@ -23,8 +23,24 @@ fn a_simulated_scan_passes_the_door_and_is_the_same_every_time() {
     assert!((2000..4000).contains(&first.cloud.len()), "{}", first.cloud.len());
     simulate(&ply, &[]).success();
     assert_eq!(read_scan(&ply, Unit::Millimetre).unwrap(), first);
-    simulate(&xyz, &["--table", "--v-blocks", "--patches", "2", "--ovality", "0.05", "--views", "2"])
-        .success();
+    simulate(
+        &xyz,
+        &[
+            "--jaws",
+            "grip",
+            "--drift-mm",
+            "0.05",
+            "--table",
+            "--v-blocks",
+            "--patches",
+            "2",
+            "--ovality",
+            "0.05",
+            "--views",
+            "2",
+        ],
+    )
+    .success();
     assert!(read_scan(&xyz, Unit::Millimetre).unwrap().cloud.len() > first.cloud.len());
 }
 
@@ -37,6 +53,7 @@ fn unusable_arguments_end_with_status_2_and_a_reason() {
         (folder.path().join("no/such/a.ply"), &[], "cannot be written"),
         (file.clone(), &["--noise-mm=-1"], "allowed is 0 to 10"),
         (file.clone(), &["--outliers", "nan"], "allowed is 0 to 1"),
+        (file.clone(), &["--jaws", "round"], "allowed is grip or flat"),
         (file, &["--views", "0"], "1..=20"),
     ] {
         let output = simulate(&out, more).code(2).get_output().stderr.clone();

@@ -8,7 +8,7 @@ use clap::Subcommand;
 use super::{Outcome, say, simulate_bender};
 use crate::cloud::write_scan;
 use crate::config::{Materials, load_part};
-use crate::sim::scan::{Density, PointKind, ScanSettings, TubeShape, scan};
+use crate::sim::scan::{Density, Jaws, PointKind, ScanSettings, TubeShape, scan};
 
 /// Arguments of `benderd simulate`.
 #[derive(Debug, clap::Args)]
@@ -57,6 +57,12 @@ struct ScanArgs {
     /// Rests the tube on V-blocks.
     #[arg(long)]
     v_blocks: bool,
+    /// Holds the tube by clamp jaws: grip (a V from either side) or flat (a face from one side).
+    #[arg(long)]
+    jaws: Option<Jaws>,
+    /// How far passes disagree (one sigma of each pass's displacement).
+    #[arg(long, default_value_t = 0.0, value_parser = at_most::<10>)]
+    drift_mm: f64,
     /// Ovality of every bend: (largest - smallest) / nominal diameter.
     #[arg(long, default_value_t = 0.0, value_parser = at_most::<1>)]
     ovality: f64,
@@ -87,6 +93,8 @@ fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
         missing_patches: args.patches.into(),
         table: args.table,
         v_blocks: args.v_blocks,
+        jaws: args.jaws,
+        pass_drift_mm: args.drift_mm,
         ..ScanSettings::default()
     };
     let got = scan(&shape, &settings, args.seed);

@@ -14,7 +14,8 @@ const MAX_ROTATION_SIGMA_RAD: f64 = 45.0 * std::f64::consts::PI / 180.0;
 const MAX_RADIUS_SIGMA_SHARE: f64 = 0.5;
 
 /// Both ends found on the scan, in space.
-struct Ends {
+#[derive(Default)]
+pub(super) struct Ends {
     first: Option<(Point3<f64>, f64)>,
     last: Option<(Point3<f64>, f64)>,
 }
@@ -27,13 +28,13 @@ struct Scanned {
 }
 
 /// All values of the tube as functions of its parameters, with the ends fixed in space.
-struct Values {
-    lengths: Vec<f64>,
-    rotations: Vec<f64>,
-    angles: Vec<f64>,
-    radii: Vec<f64>,
-    corners: Vec<f64>,
-    tube_radius: Vec<f64>,
+pub(super) struct Values {
+    pub lengths: Vec<f64>,
+    pub rotations: Vec<f64>,
+    pub angles: Vec<f64>,
+    pub radii: Vec<f64>,
+    pub corners: Vec<f64>,
+    pub tube_radius: Vec<f64>,
 }
 
 /// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values.
@@ -229,7 +230,7 @@ fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
     Scanned { ends, first, last }
 }
 
-fn values(model: &TubeModel, ends: &Ends) -> Values {
+pub(super) fn values(model: &TubeModel, ends: &Ends) -> Values {
     let spine = model.spine();
     let n = model.lra.bends.len();
     let mut lengths: Vec<f64> = model.lra.bends.iter().map(|b| b.length_mm).collect();
@@ -269,7 +270,7 @@ impl Values {
     }
 
     /// Other numbers in the same order as [`Values::flat`].
-    fn like(&self, flat: Vec<f64>) -> Values {
+    pub fn like(&self, flat: Vec<f64>) -> Values {
         let mut rest = flat.into_iter();
         let mut take = |like: &[f64]| rest.by_ref().take(like.len()).collect();
         Values {
@@ -284,7 +285,7 @@ impl Values {
 }
 
 /// Derivatives of all values by all parameters (central differences of closed formulas).
-fn jacobian(model: &TubeModel, parameters: &[Parameter], ends: &Ends) -> DMatrix<f64> {
+pub(super) fn jacobian(model: &TubeModel, parameters: &[Parameter], ends: &Ends) -> DMatrix<f64> {
     let base = values(model, ends);
     let mut out = DMatrix::zeros(base.flat().len(), parameters.len());
     let h = 1e-6;

@@ -6,6 +6,7 @@
 
 pub mod apollonius;
 pub mod arcline;
+pub mod bound;
 pub mod crust;
 pub mod cylinder;
 mod direction;

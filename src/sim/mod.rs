@@ -5,3 +5,4 @@ pub mod bender_server;
 pub mod forming;
 pub mod population;
 pub mod scan;
+pub mod scan_file;

@@ -3,6 +3,9 @@
 //!
 //! Left out is what no data could tell: two bends in one plane the same way, or a shallow bend and its neighbour,
 //! have a straight of a diameter between them; and every tube can be seen whole from the side it is scanned from.
+//! [`random_scene`] spoils such scans in every way.
+
+mod hard;
 
 use std::f64::consts::PI;
 
@@ -12,6 +15,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::scan::{Density, ScanSettings, TubeShape};
 use crate::tube::{Bend, Frame, Lra, Spine};
+
+pub use hard::{Scene, random_scene};
 
 /// One member of the population: the tube and how it is scanned.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,7 +51,30 @@ pub fn random_tube(seed: u64) -> Specimen {
     let points = (2.0 * radius_mm * lra.developed_length_mm() / (spacing_mm * spacing_mm)) as usize;
     let density = Density::Points(points.clamp(3_000, 60_000));
     let settings = ScanSettings { density, sight: Some(sight), ..ScanSettings::default() };
-    Specimen { shape: TubeShape { ovality, ..TubeShape::round(lra, 2.0 * radius_mm) }, settings, common_clr }
+    let shape = TubeShape { ovality, ..TubeShape::round(lra, 2.0 * radius_mm) };
+    Specimen { shape, settings, common_clr }
+}
+
+/// The tube of paper 000's Results (section 8), as far as it is described there: radius 4 mm, 268 mm long, 5 bends, 6005
+/// points.
+pub fn papers_tube() -> Specimen {
+    let bend = |length_mm, rotation_deg: f64, angle_deg: f64| Bend {
+        length_mm,
+        rotation_rad: rotation_deg.to_radians(),
+        angle_rad: angle_deg.to_radians(),
+        radius_mm: 15.0,
+    };
+    let bends = vec![
+        bend(30.0, 0.0, 60.0),
+        bend(25.0, 90.0, 45.0),
+        bend(30.0, -60.0, 4.0),
+        bend(25.0, 120.0, 90.0),
+        bend(20.0, 180.0, 70.0),
+    ];
+    let mut lra = Lra { bends, last_length_mm: 0.0 };
+    lra.last_length_mm = 268.0 - lra.developed_length_mm();
+    let settings = ScanSettings { density: Density::Points(6005), ..ScanSettings::default() };
+    Specimen { shape: TubeShape::round(lra, 8.0), settings, common_clr: true }
 }
 
 fn log_uniform(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {

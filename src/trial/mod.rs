@@ -1,4 +1,4 @@
-//! The whole chain run against the simulators: the demo.
+//! The whole chain run against the simulators: the demo; and the reconstruction measured on many simulated scans.
 //!
 //! ```text
 //! demo      the daemon's own cell loop, and the person at it
@@ -6,8 +6,10 @@
 //! record    one part, as a table
 //! story     what is told before, between and after
 //! picture   all parts as one SVG
+//! accuracy  how right and how accurate the reconstruction is
 //! ```
 
+pub mod accuracy;
 mod demo;
 mod picture;
 mod record;

@@ -3,7 +3,8 @@
 //! Stripes of light cross the tube; along each stripe, rays are cast at regular steps against the exact surface
 //! (`solid`), so a point before noise lies on the ideal tube to the last digit, and whatever stands in front hides
 //! what is behind. `sweep` adds what spoils real scans: noise that grows at grazing incidence, dropouts, flying
-//! points, patches without data, a table and V-blocks. Shares no code with the estimators.
+//! points, patches without data, passes that disagree, a tube that was not scanned to its end; `props` a table,
+//! V-blocks and clamp jaws. Shares no code with the estimators.
 
 mod end;
 mod props;
@@ -12,6 +13,8 @@ mod sweep;
 
 #[cfg(test)]
 mod tests;
+
+use std::str::FromStr;
 
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -87,8 +90,44 @@ pub struct ScanSettings {
     pub table: bool,
     /// V-blocks under its long straights.
     pub v_blocks: bool,
+    /// Clamp jaws on up to two of its straights.
+    pub jaws: Option<Jaws>,
+    /// An end that was not scanned.
+    pub unseen_end: Option<UnseenEnd>,
     /// Standard deviation of the rigid displacement of every pass after the first.
     pub pass_drift_mm: f64,
+}
+
+/// How clamp jaws touch the tube.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Jaws {
+    /// A V from either side.
+    Grip,
+    /// A flat face from one side.
+    Flat,
+}
+
+impl FromStr for Jaws {
+    type Err = String;
+
+    fn from_str(word: &str) -> Result<Jaws, String> {
+        match word {
+            "grip" => Ok(Jaws::Grip),
+            "flat" => Ok(Jaws::Flat),
+            _ => Err("allowed is grip or flat".to_owned()),
+        }
+    }
+}
+
+/// Where a scan stops short of the tube's end: at a plane across the end straight.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnseenEnd {
+    /// The last end; otherwise the first.
+    pub last: bool,
+    /// How much of the tube is not seen, along its centre line. No more than the end straight.
+    pub unseen_mm: f64,
+    /// How oblique the plane is; 0 is square to the tube.
+    pub tilt_rad: f64,
 }
 
 impl Default for ScanSettings {
@@ -104,6 +143,8 @@ impl Default for ScanSettings {
             missing_patches: 0,
             table: false,
             v_blocks: false,
+            jaws: None,
+            unseen_end: None,
             pass_drift_mm: 0.0,
         }
     }
@@ -114,7 +155,7 @@ impl Default for ScanSettings {
 pub enum PointKind {
     /// On the tube, but for noise.
     Tube,
-    /// On the table or a V-block, but for noise.
+    /// On the table, a V-block or a jaw, but for noise.
     Surroundings,
     /// A flying point.
     Outlier,

@@ -12,7 +12,7 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use super::solid::{Cast, Chunk, Ray};
-use super::{Density, PointKind, ScanSettings, Scene};
+use super::{Density, PointKind, ScanSettings, Scene, UnseenEnd};
 use crate::tube::Spine;
 
 /// Stripes lie wider apart than the points of one stripe.
@@ -27,6 +27,8 @@ const MOST_NOISE: f64 = 3.0;
 const STEEPEST_PASS_RAD: f64 = 0.96;
 /// Points around the tube that are scanned with it, in tube radii.
 const MARGIN_RADII: f64 = 1.5;
+/// Radius of the largest patch without data, in tube radii.
+const LARGEST_PATCH_RADII: f64 = 1.5;
 
 /// A point and what it is.
 pub(super) type Hit = (Point3<f64>, PointKind);
@@ -52,6 +54,33 @@ struct Patch {
     radius_mm: f64,
 }
 
+/// The plane across an end straight beyond which nothing was scanned.
+struct Window<'a> {
+    spine: &'a Spine,
+    segment: usize,
+    at: Point3<f64>,
+    outward: Vector3<f64>,
+}
+
+impl<'a> Window<'a> {
+    fn new(end: &UnseenEnd, spine: &'a Spine) -> Window<'a> {
+        let length_mm = spine.length_mm();
+        let (mm, sign, segment) = match end.last {
+            true => (length_mm - end.unseen_mm, 1.0, spine.segments().len() - 1),
+            false => (end.unseen_mm, -1.0, 0),
+        };
+        let frame = spine.frame_at(mm);
+        let tilted = Rotation3::from_axis_angle(&Vector3::z_axis(), end.tilt_rad) * Vector3::x();
+        let outward = frame.rotation * tilted * sign;
+        Window { spine, segment, at: frame.translation.vector.into(), outward }
+    }
+
+    /// Whether a point is beyond it. Other legs may reach beyond the plane.
+    fn hides(&self, p: &Point3<f64>) -> bool {
+        (p - self.at).dot(&self.outward) > 0.0 && self.spine.closest(p).segment == self.segment
+    }
+}
+
 /// Where a chunk of the tube is met by a stripe: from, to, and the piece it belongs to.
 type Span = (f64, f64, usize);
 
@@ -61,6 +90,7 @@ struct Sweep<'a> {
     settings: &'a ScanSettings,
     chunks: Vec<Chunk>,
     patches: Vec<Patch>,
+    window: Option<Window<'a>>,
     along_mm: f64,
     between_mm: f64,
 }
@@ -79,7 +109,8 @@ pub(super) fn all_passes(
     if chunks.is_empty() || !(along_mm * between_mm).is_normal() {
         return Vec::new();
     }
-    let sweep = Sweep { scene, settings, chunks, patches, along_mm, between_mm };
+    let window = settings.unseen_end.as_ref().map(|end| Window::new(end, spine));
+    let sweep = Sweep { scene, settings, chunks, patches, window, along_mm, between_mm };
     passes.iter().flat_map(|p| sweep.pass(p)).collect()
 }
 
@@ -114,13 +145,16 @@ fn any_across(v: &Vector3<f64>) -> Vector3<f64> {
 /// A patch on the side that faces the first pass.
 fn patch(scene: &Scene, spine: &Spine, rng: &mut ChaCha8Rng) -> Patch {
     let r = scene.solid.radius_mm();
-    let frame = spine.frame_at(rng.random_range(0.0..=1.0) * spine.length_mm());
+    // Clear of the ends: where the tube ends must not be hidden.
+    let margin_mm = (LARGEST_PATCH_RADII * r).min(spine.length_mm() / 2.0);
+    let room_mm = spine.length_mm() - 2.0 * margin_mm;
+    let frame = spine.frame_at(margin_mm + rng.random_range(0.0..=1.0) * room_mm);
     let tangent = frame.rotation * Vector3::x_axis();
     let facing = scene.up - *tangent * tangent.dot(&scene.up);
     let facing = facing.try_normalize(1e-6).unwrap_or_else(|| any_across(&tangent));
     let turned = Rotation3::from_axis_angle(&tangent, rng.random_range(-1.0..1.0)) * facing;
     let centre = Point3::from(frame.translation.vector) + turned * r;
-    Patch { centre, radius_mm: r * rng.random_range(0.4..1.5) }
+    Patch { centre, radius_mm: r * rng.random_range(0.4..LARGEST_PATCH_RADII) }
 }
 
 /// Steps along and between stripes.
@@ -227,7 +261,8 @@ impl Sweep<'_> {
         let ideal = ray.at(t);
         let on_patch = |p: &Patch| (ideal - p.centre).norm() < p.radius_mm;
         let patched = kind == PointKind::Tube && self.patches.iter().any(on_patch);
-        if patched || rng.random::<f64>() < self.lost_share(cosine) {
+        let hidden = self.window.as_ref().is_some_and(|w| w.hides(&ideal));
+        if patched || hidden || rng.random::<f64>() < self.lost_share(cosine) {
             return None;
         }
         if rng.random::<f64>() < self.settings.outlier_share {

@@ -299,3 +299,46 @@ fn the_crown_of_the_tube_has_no_gaps() {
         assert!(*least > 60, "{least} points in a bin that should have about 200");
     }
 }
+
+#[test]
+fn jaws_touch_the_tube_from_outside() {
+    for jaws in [Jaws::Grip, Jaws::Flat] {
+        let settings = ScanSettings { jaws: Some(jaws), sight: Some(-Vector3::z()), ..clean(40_000) };
+        let got = scan(&hairpin(), &settings, 9);
+        let jaw: Vec<_> =
+            got.points.iter().zip(&got.kinds).filter(|(_, k)| **k == PointKind::Surroundings).collect();
+        assert!(jaw.len() > 300, "{jaws:?}: {}", jaw.len());
+        let gaps = jaw.iter().map(|(p, _)| got.spine.closest(p).distance_mm - 10.0);
+        let (closest, farthest) =
+            gaps.fold((f64::INFINITY, 0.0), |(a, b): (f64, f64), g| (a.min(g), b.max(g)));
+        assert!(closest > -1e-9 && closest < 8.0, "{jaws:?}: {closest}");
+        assert!(farthest > 5.0 && farthest < 40.0, "{jaws:?}: {farthest}");
+        // They hold both legs in their middle, and the tube shows between them.
+        let held = |p: &Point3<f64>| (p.x - 100.0).abs() < 15.0;
+        assert!(jaw.iter().all(|(p, _)| held(p)));
+        let shown = got.points.iter().zip(&got.kinds).filter(|(p, k)| **k == PointKind::Tube && held(p));
+        assert!(shown.count() > 300);
+    }
+}
+
+#[test]
+fn an_end_that_is_not_seen_has_no_points_and_other_legs_have_theirs() {
+    for (last, tilt_rad) in [(true, 0.0), (false, 0.0), (true, 0.6)] {
+        let unseen_end = Some(UnseenEnd { last, unseen_mm: 120.0, tilt_rad });
+        let settings = ScanSettings { unseen_end, outlier_share: 0.01, ..clean(20_000) };
+        let got = scan(&hairpin(), &settings, 9);
+        let length = got.spine.length_mm();
+        let from_end = |p: &Point3<f64>| {
+            let along = got.spine.closest(p).arc_length_mm;
+            if last { length - along } else { along }
+        };
+        let tube =
+            || got.points.iter().zip(&got.kinds).filter(|(_, k)| **k == PointKind::Tube).map(|(p, _)| p);
+        let closest = tube().map(from_end).fold(f64::INFINITY, f64::min);
+        let slant = 10.0 * tilt_rad.tan();
+        assert!((closest - (120.0 - slant)).abs() < 2.5, "{closest} at {tilt_rad}");
+        // The other leg, beside it, is seen to its end.
+        let other = tube().map(|p| length - from_end(p)).fold(f64::INFINITY, f64::min);
+        assert!(other < 2.0, "{other}");
+    }
+}
