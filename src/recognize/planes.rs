@@ -1,0 +1,336 @@
+//! Planar faces of a cloud: a table, the flanks of V-blocks, clamp jaws (paper 002, section 3).
+//!
+//! The cloud is cut into patches; each patch's regression plane is a point in the space of planes, where the patches of
+//! one face lie together. The distance of two planes is measured over a domain of interest by point masses (paper
+//! 002, equation 5): here over the patch's own points, so that it does not depend on where a plane would run
+//! far from its data. A cluster grows from a patch, its domain doubling with each round.
+
+use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
+
+/// A planar face.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Face {
+    /// Unit normal, of either sign.
+    pub normal: Vector3<f64>,
+    /// `normal . p` of its points p, millimetres.
+    pub offset_mm: f64,
+    /// Root mean square distance of its points.
+    pub sigma_mm: f64,
+    /// Its points, ascending indices into the cloud.
+    pub points: Vec<u32>,
+}
+
+impl Face {
+    /// Signed distance of a point from the face's plane.
+    pub fn distance_mm(&self, p: &Point3<f64>) -> f64 {
+        self.normal.dot(&p.coords) - self.offset_mm
+    }
+
+    /// Whether a point lies on the plane as far as noise tells.
+    pub fn holds(&self, p: &Point3<f64>) -> bool {
+        self.distance_mm(p).abs() < TOLERANCE_SIGMAS * self.sigma_mm
+    }
+}
+
+/// Points farther from a plane than this many sigmas are not its own.
+const TOLERANCE_SIGMAS: f64 = 4.0;
+
+/// Edge of a patch in spacings of the points: about forty points.
+const PATCH_SPACINGS: f64 = 6.0;
+
+/// Fewest points of a patch that tell a plane.
+const MIN_POINTS: usize = 8;
+
+/// A patch belongs to a cluster up to this many times the noise.
+const CLUSTER_SIGMAS: f64 = 2.5;
+
+/// Share of all points, those of the flattest patches, that tells the noise.
+const FLAT_SHARE: f64 = 0.2;
+
+/// Patches from which clusters are grown.
+const SEEDS: usize = 48;
+
+/// Faces are at least this many patches wide: narrower ones do no harm.
+const MIN_WIDTH: f64 = 2.0;
+
+/// A slab four times as thick holds twice the points of a cylinder (square root of four) and as many of a plane.
+const MOST_GROWTH: f64 = 1.6;
+
+/// Sagitta across a face's narrow side in sigmas: a plane has none.
+const MOST_SAGITTA: f64 = 1.0;
+
+/// More faces than this are not looked for.
+const MOST_FACES: usize = 24;
+
+/// Points of one voxel and their moments about `anchor`.
+#[derive(Debug, Clone)]
+struct Patch {
+    key: [i32; 3],
+    members: Vec<u32>,
+    moments: Moments,
+    centre: Point3<f64>,
+    rms_mm: f64,
+}
+
+/// Zeroth, first and second moments.
+#[derive(Debug, Clone, Copy, Default)]
+struct Moments {
+    count: f64,
+    first: Vector3<f64>,
+    second: Matrix3<f64>,
+}
+
+/// A plane of regression.
+#[derive(Debug, Clone, Copy)]
+struct Plane {
+    normal: Vector3<f64>,
+    offset_mm: f64,
+    rms_mm: f64,
+    /// Direction of the smaller extent within the plane and root mean square extent there.
+    narrow: Vector3<f64>,
+    width_mm: f64,
+}
+
+impl Moments {
+    fn add(&mut self, p: &Vector3<f64>) {
+        self.count += 1.0;
+        self.first += p;
+        self.second += p * p.transpose();
+    }
+
+    fn merge(&mut self, other: &Moments) {
+        self.count += other.count;
+        self.first += other.first;
+        self.second += other.second;
+    }
+
+    /// Plane of regression (least squares of the orthogonal distances).
+    fn plane(&self) -> Plane {
+        let mean = self.first / self.count;
+        let eigen = SymmetricEigen::new(self.second / self.count - mean * mean.transpose());
+        let mut order = [0, 1, 2];
+        order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
+        let extent = |k: usize| eigen.eigenvalues[order[k]].max(0.0).sqrt();
+        let axis = |k: usize| eigen.eigenvectors.column(order[k]).into_owned();
+        let normal = axis(0);
+        Plane {
+            normal,
+            offset_mm: normal.dot(&mean),
+            rms_mm: extent(0),
+            narrow: axis(1),
+            width_mm: extent(1),
+        }
+    }
+
+    /// Root mean square distance of the points from a plane: the distance in the space of planes, over the
+    /// patch, with the patch's own noise.
+    fn distance_mm(&self, plane: &Plane) -> f64 {
+        let n = &plane.normal;
+        let square = n.dot(&(self.second * n)) - 2.0 * plane.offset_mm * n.dot(&self.first);
+        (square / self.count + plane.offset_mm * plane.offset_mm).max(0.0).sqrt()
+    }
+}
+
+/// Finds the planar faces of a cloud whose points lie about `spacing_mm` apart, the one with most points first. A point
+/// belongs to one face at most.
+pub fn find_planes(points: &[Point3<f64>], spacing_mm: f64) -> Vec<Face> {
+    let cell_mm = PATCH_SPACINGS * spacing_mm;
+    if points.is_empty() || !cell_mm.is_normal() {
+        return Vec::new();
+    }
+    // Moments about the cloud's own place: coordinates far from the origin would cancel.
+    let anchor = points[points.len() / 2];
+    let local: Vec<Vector3<f64>> = points.iter().map(|p| p - anchor).collect();
+    let patches = cut(&local, cell_mm);
+    let Some(noise_mm) = noise(&patches) else { return Vec::new() };
+    let mut search = Search { points: &local, taken: vec![false; local.len()], patches, noise_mm, cell_mm };
+    let mut faces = Vec::new();
+    while faces.len() < MOST_FACES {
+        let Some(mut face) = search.largest() else { break };
+        face.offset_mm += face.normal.dot(&anchor.coords);
+        faces.push(face);
+    }
+    faces.sort_by_key(|f| std::cmp::Reverse(f.points.len()));
+    faces
+}
+
+/// The cloud cut into voxels, in the order of their keys.
+fn cut(points: &[Vector3<f64>], cell_mm: f64) -> Vec<Patch> {
+    let key = |p: &Vector3<f64>| -> [i32; 3] { p.map(|v| (v / cell_mm).floor() as i32).into() };
+    let mut order: Vec<([i32; 3], u32)> =
+        points.iter().enumerate().map(|(i, p)| (key(p), i as u32)).collect();
+    order.sort_unstable();
+    let patch = |run: &[([i32; 3], u32)]| {
+        let members: Vec<u32> = run.iter().map(|r| r.1).collect();
+        let mut moments = Moments::default();
+        members.iter().for_each(|&i| moments.add(&points[i as usize]));
+        let plane = moments.plane();
+        // A sliver at a voxel's corner is flat whatever it belongs to.
+        let tells = members.len() >= MIN_POINTS && plane.width_mm > 0.12 * cell_mm;
+        let rms_mm = if tells { plane.rms_mm } else { f64::INFINITY };
+        Patch { key: run[0].0, members, moments, centre: Point3::from(moments.first / moments.count), rms_mm }
+    };
+    order.chunk_by(|a, b| a.0 == b.0).map(patch).collect()
+}
+
+/// Noise of the flattest patches.
+fn noise(patches: &[Patch]) -> Option<f64> {
+    let mut flat: Vec<&Patch> = patches.iter().filter(|p| p.rms_mm.is_finite()).collect();
+    flat.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
+    let all: usize = patches.iter().map(|p| p.members.len()).sum();
+    let mut seen = 0;
+    let enough = flat.iter().find(|p| {
+        seen += p.members.len();
+        seen as f64 >= FLAT_SHARE * all as f64
+    });
+    enough.or(flat.last()).map(|p| p.rms_mm)
+}
+
+/// What is left to be searched.
+struct Search<'a> {
+    points: &'a [Vector3<f64>],
+    taken: Vec<bool>,
+    patches: Vec<Patch>,
+    noise_mm: f64,
+    cell_mm: f64,
+}
+
+impl Search<'_> {
+    /// The largest face that is left; its patches are gone afterwards.
+    fn largest(&mut self) -> Option<Face> {
+        let flat = |p: &Patch| p.rms_mm < 1.5 * self.noise_mm;
+        let seeds: Vec<usize> = (0..self.patches.len()).filter(|&i| flat(&self.patches[i])).collect();
+        let stride = seeds.len().div_ceil(SEEDS).max(1);
+        let mut clusters: Vec<Vec<usize>> =
+            seeds.iter().step_by(stride).filter_map(|&s| self.grow(s)).collect();
+        let size = |c: &Vec<usize>| c.iter().map(|&i| self.patches[i].members.len()).sum::<usize>();
+        clusters.sort_by(|a, b| size(b).cmp(&size(a)).then_with(|| a.cmp(b)));
+        clusters.dedup();
+        let (cluster, face) =
+            clusters.into_iter().find_map(|c| Some((self.face(&c)?, c)).map(|(f, c)| (c, f)))?;
+        for &i in &face.points {
+            self.taken[i as usize] = true;
+        }
+        let mut index = 0;
+        self.patches.retain(|_| {
+            index += 1;
+            cluster.binary_search(&(index - 1)).is_err()
+        });
+        Some(face)
+    }
+
+    /// The patches around `seed` that lie on one plane with it, ascending; None when its own surroundings do not.
+    fn grow(&self, seed: usize) -> Option<Vec<usize>> {
+        let at = self.patches[seed].centre;
+        let mut plane = self.patches[seed].moments.plane();
+        let mut reach = 1.8 * self.cell_mm;
+        let mut cluster = Vec::new();
+        for round in 0.. {
+            let mut near = 0;
+            let mut found = Vec::new();
+            for (i, patch) in self.patches.iter().enumerate() {
+                if patch.rms_mm.is_finite() && (patch.centre - at).norm_squared() < reach * reach {
+                    near += 1;
+                    if patch.moments.distance_mm(&plane) < CLUSTER_SIGMAS * self.noise_mm {
+                        found.push(i);
+                    }
+                }
+            }
+            if round == 0 && (found.len() < 4 || 2 * found.len() < near) {
+                return None;
+            }
+            let settled = found.len() == cluster.len();
+            cluster = found;
+            if cluster.len() < 4 {
+                return None;
+            }
+            plane = self.regression(&cluster);
+            if (settled && round > 2) || round == 14 {
+                break;
+            }
+            reach *= 2.0;
+        }
+        Some(cluster)
+    }
+
+    fn regression(&self, cluster: &[usize]) -> Plane {
+        let mut sum = Moments::default();
+        cluster.iter().for_each(|&i| sum.merge(&self.patches[i].moments));
+        sum.plane()
+    }
+
+    /// The face of a cluster, with the points of the patches beside it that lie on its plane; None when it is narrow or
+    /// curved.
+    fn face(&self, cluster: &[usize]) -> Option<Face> {
+        let plane = self.regression(cluster);
+        if plane.width_mm * 12f64.sqrt() < MIN_WIDTH * self.cell_mm {
+            return None;
+        }
+        let sigma_mm = plane.rms_mm.max(1e-6 * self.cell_mm);
+        let (mut points, mut wider, mut core) = (Vec::new(), 0, 0);
+        let (mut bow, mut inner) = ([0.0; 5], [0.0; 3]);
+        let middle = self.regression_centre(cluster);
+        for (i, patch) in self.patches.iter().enumerate() {
+            let own = cluster.binary_search(&i).is_ok();
+            if !own && !self.is_beside(patch, cluster) {
+                continue;
+            }
+            for &k in &patch.members {
+                let p = &self.points[k as usize];
+                let off = p.dot(&plane.normal) - plane.offset_mm;
+                if self.taken[k as usize] {
+                    continue;
+                }
+                wider += usize::from(off.abs() < 12.0 * sigma_mm);
+                core += usize::from(off.abs() < 3.0 * sigma_mm);
+                if off.abs() < TOLERANCE_SIGMAS * sigma_mm {
+                    points.push(k);
+                    let u = (p - middle).dot(&plane.narrow) / plane.width_mm;
+                    accumulate(&mut bow, &mut inner, u, off);
+                }
+            }
+        }
+        points.sort_unstable();
+        let curved = sagitta(&bow, &inner).abs() > MOST_SAGITTA * sigma_mm;
+        let grows = wider as f64 > MOST_GROWTH * core as f64;
+        let face = Face { normal: plane.normal, offset_mm: plane.offset_mm, sigma_mm, points };
+        (!curved && !grows).then_some(face)
+    }
+
+    fn regression_centre(&self, cluster: &[usize]) -> Vector3<f64> {
+        let mut sum = Moments::default();
+        cluster.iter().for_each(|&i| sum.merge(&self.patches[i].moments));
+        sum.first / sum.count
+    }
+
+    /// Whether a patch touches one of the cluster's.
+    fn is_beside(&self, patch: &Patch, cluster: &[usize]) -> bool {
+        let touches = |key: [i32; 3]| {
+            let at = self.patches.binary_search_by(|p| p.key.cmp(&key));
+            at.is_ok_and(|i| cluster.binary_search(&i).is_ok())
+        };
+        let [x, y, z] = patch.key;
+        (-1..=1).any(|a| (-1..=1).any(|b| (-1..=1).any(|c| touches([x + a, y + b, z + c]))))
+    }
+}
+
+/// Sums for the parabola `off = a + b u^2` (u in units of the width): powers of u, and `off` times them.
+fn accumulate(powers: &mut [f64; 5], right: &mut [f64; 3], u: f64, off: f64) {
+    let mut power = 1.0;
+    for k in 0..5 {
+        powers[k] += power;
+        if k < 3 {
+            right[k] += power * off;
+        }
+        power *= u;
+    }
+}
+
+/// Height of the parabola from the face's middle to its sides.
+fn sagitta(powers: &[f64; 5], right: &[f64; 3]) -> f64 {
+    let [s0, s1, s2, s3, s4] = *powers;
+    let normal = Matrix3::new(s0, s1, s2, s1, s2, s3, s2, s3, s4);
+    let solved = normal.cholesky().map(|c| c.solve(&Vector3::from(*right)));
+    // A uniform width reaches 1.7 root mean squares to either side.
+    solved.map_or(0.0, |c| c[2] * 3.0)
+}
