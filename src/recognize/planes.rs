@@ -59,6 +59,9 @@ const MOST_GROWTH: f64 = 1.6;
 /// Sagitta across a face's narrow side in sigmas: a plane has none.
 const MOST_SAGITTA: f64 = 1.0;
 
+/// Doming of a face's patches that is no chance.
+const DOME_SIGMAS: f64 = 4.0;
+
 /// More faces than this are not looked for.
 const MOST_FACES: usize = 24;
 
@@ -86,9 +89,10 @@ struct Plane {
     normal: Vector3<f64>,
     offset_mm: f64,
     rms_mm: f64,
-    /// Direction of the smaller extent within the plane and root mean square extent there.
+    /// Direction of the smaller extent within the plane, root mean square extent there and along the larger one.
     narrow: Vector3<f64>,
     width_mm: f64,
+    length_mm: f64,
 }
 
 impl Moments {
@@ -119,6 +123,7 @@ impl Moments {
             rms_mm: extent(0),
             narrow: axis(1),
             width_mm: extent(1),
+            length_mm: extent(2),
         }
     }
 
@@ -184,6 +189,41 @@ fn noise(patches: &[Patch]) -> Option<f64> {
         seen as f64 >= FLAT_SHARE * all as f64
     });
     enough.or(flat.last()).map(|p| p.rms_mm)
+}
+
+/// How the patches of a face are domed: regression of height over squared distance from the patch's middle, each
+/// patch about its own means. The tops of a tube that lies in a plane have a common tangent plane, wide enough for
+/// a face, but each patch of them is round.
+#[derive(Debug, Default)]
+struct Dome {
+    product: f64,
+    square: f64,
+}
+
+impl Dome {
+    fn add(&mut self, patch: &Patch, points: &[Vector3<f64>], normal: &Vector3<f64>) {
+        let (mut h, mut s, mut hs, mut ss) = (0.0, 0.0, 0.0, 0.0);
+        for &k in &patch.members {
+            let from = points[k as usize] - patch.centre.coords;
+            let height = from.dot(normal);
+            let square = from.norm_squared() - height * height;
+            h += height;
+            s += square;
+            hs += height * square;
+            ss += square * square;
+        }
+        let n = patch.members.len() as f64;
+        self.product += hs - h * s / n;
+        self.square += ss - s * s / n;
+    }
+
+    /// Whether the doming is beyond chance and its radius (a cylinder's: height falls by square / 4 r) smaller than the
+    /// face.
+    fn is_round(&self, sigma_mm: f64, length_mm: f64) -> bool {
+        let slope = (self.product / self.square.max(f64::MIN_POSITIVE)).abs();
+        let chance = sigma_mm / self.square.max(f64::MIN_POSITIVE).sqrt();
+        slope > DOME_SIGMAS * chance && 1.0 < 4.0 * slope * length_mm
+    }
 }
 
 /// What is left to be searched.
@@ -269,11 +309,15 @@ impl Search<'_> {
         let sigma_mm = plane.rms_mm.max(1e-6 * self.cell_mm);
         let (mut points, mut wider, mut core) = (Vec::new(), 0, 0);
         let (mut bow, mut inner) = ([0.0; 5], [0.0; 3]);
+        let mut dome = Dome::default();
         let middle = self.regression_centre(cluster);
         for (i, patch) in self.patches.iter().enumerate() {
             let own = cluster.binary_search(&i).is_ok();
             if !own && !self.is_beside(patch, cluster) {
                 continue;
+            }
+            if own {
+                dome.add(patch, self.points, &plane.normal);
             }
             for &k in &patch.members {
                 let p = &self.points[k as usize];
@@ -291,7 +335,8 @@ impl Search<'_> {
             }
         }
         points.sort_unstable();
-        let curved = sagitta(&bow, &inner).abs() > MOST_SAGITTA * sigma_mm;
+        let curved =
+            sagitta(&bow, &inner).abs() > MOST_SAGITTA * sigma_mm || dome.is_round(sigma_mm, plane.length_mm);
         let grows = wider as f64 > MOST_GROWTH * core as f64;
         let face = Face { normal: plane.normal, offset_mm: plane.offset_mm, sigma_mm, points };
         (!curved && !grows).then_some(face)

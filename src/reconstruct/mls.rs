@@ -16,13 +16,19 @@ pub const SPINE_SPACING_RADII: f64 = 0.3;
 pub const WORK_CELL_RADII: f64 = 0.15;
 
 /// Cell of the points whose jets guess the spine, in tube radii.
-const SEED_CELL_RADII: f64 = 0.4;
+const SEED_CELL_RADII: f64 = 0.5;
 
 /// Distance of the places at which cylinders are fitted, in tube radii.
 const GUESS_SPACING_RADII: f64 = 0.25;
 
 /// Curvatures that differ more are something else's and say nothing of the noise.
 const MOST_ERROR: f64 = 0.5;
+
+/// Spine points this near to each other must be on one spine: no farther aside of the other's tangent than errors and
+/// a bend of two radii explain (its sagitta is along^2 / 4).
+const APART_RADII: f64 = 1.4;
+const ASIDE_RADII: f64 = 0.15;
+const TIGHTEST_RADII: f64 = 0.25;
 
 /// Share of the points around a cylinder that must lie on it.
 const LEAST_SHARE: f64 = 0.5;
@@ -67,13 +73,36 @@ pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
         .map(|j| SpinePoint { point: j.foot - j.normal * radius_mm, tangent: j.weak_direction })
         .collect();
     let places = condense(&guesses, GUESS_SPACING_RADII * radius_mm);
-    places
+    let found: Vec<Option<Projected>> = places
         .par_iter()
         .map_init(Near::default, |near, place| project(place, radius_mm, near, work, &index))
-        .collect::<Vec<_>>()
-        .into_iter()
-        .flatten()
-        .collect()
+        .collect();
+    strongest(found.into_iter().flatten().collect(), radius_mm)
+}
+
+/// A spine point and how many points bear it out.
+type Projected = (SpinePoint, f64);
+
+/// Two tubes cannot be nearer than two radii: of spine points that lie side by side only the better borne out stay.
+fn strongest(mut found: Vec<Projected>, radius_mm: f64) -> Vec<SpinePoint> {
+    found.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let points: Vec<Point3<f64>> = found.iter().map(|f| f.0.point).collect();
+    let index = Neighbours::new(&PointCloud::from_points(&points));
+    let mut dropped = vec![false; found.len()];
+    let mut near = Vec::new();
+    for (i, (spine, _)) in found.iter().enumerate() {
+        if dropped[i] {
+            continue;
+        }
+        index.within(&spine.point, APART_RADII * radius_mm, &mut near);
+        for &k in near.iter().filter(|&&k| k as usize > i) {
+            let gap = (points[k as usize] - spine.point) / radius_mm;
+            let along = gap.dot(&spine.tangent);
+            let aside = (gap.norm_squared() - along * along).max(0.0).sqrt();
+            dropped[k as usize] |= aside > ASIDE_RADII + TIGHTEST_RADII * along * along;
+        }
+    }
+    found.iter().zip(dropped).filter(|(_, d)| !d).map(|(f, _)| f.0).collect()
 }
 
 /// One projection: a cylinder from the guessed axis, and the outlier rules.
@@ -83,12 +112,13 @@ fn project(
     near: &mut Near,
     work: &PointCloud,
     index: &Neighbours,
-) -> Option<SpinePoint> {
+) -> Option<Projected> {
     let start = Cylinder::guess(place.point, place.tangent, radius_mm);
     let points = near.within(work, index, &start.centre, REACH_RADII * radius_mm);
     let cylinder = fit_cylinder(points, &start, false)?;
     let fits = cylinder.opening > LEAST_OPENING && cylinder.share > LEAST_SHARE;
-    fits.then_some(SpinePoint { point: cylinder.centre, tangent: cylinder.axis })
+    let spine = SpinePoint { point: cylinder.centre, tangent: cylinder.axis };
+    fits.then_some((spine, cylinder.count as f64 * cylinder.share))
 }
 
 /// Thins the spine cloud to points about `spacing_mm` apart, each moved sideways onto the mean of its

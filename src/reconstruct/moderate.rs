@@ -21,7 +21,7 @@ pub struct Moderate {
 const ENOUGH_POINTS: usize = 30_000;
 
 /// Points that are sorted into cells to get there.
-const MOST_SORTED: usize = 400_000;
+const MOST_SORTED: usize = 200_000;
 
 /// Points that tell the area, and cells that they are to fill.
 const PROBE_POINTS: usize = 8_000;
@@ -30,9 +30,6 @@ const PROBE_CELLS: usize = 1_000;
 /// Places that tell the spacing, and the neighbours looked at there.
 const PLACES: usize = 64;
 const NEIGHBOURS: usize = 12;
-
-/// Cells that a surface cuts, per area of a cell's face.
-const CELLS_PER_FACE: f64 = 1.5;
 
 /// At most some tens of thousands of a cloud's points, evenly spread.
 pub fn moderate(cloud: &PointCloud) -> Moderate {
@@ -70,7 +67,8 @@ fn scrambled(k: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// About the area of the surface on which the points lie.
+/// About the area of the surface on which the points lie: a cell's face for each cell that it cuts, which is half as
+/// much again as it is, and half as much again are the cells that the thinning will find.
 fn area_mm2(probe: &PointCloud) -> f64 {
     let diagonal = probe.bounds().map_or(0.0, |(low, high)| (high - low).norm());
     let mut cell = diagonal / 200.0;
@@ -79,7 +77,7 @@ fn area_mm2(probe: &PointCloud) -> f64 {
         cell *= 1.5;
         cells = cells.thinned(cell);
     }
-    cells.len() as f64 * cell * cell / CELLS_PER_FACE
+    cells.len() as f64 * cell * cell
 }
 
 /// Usual distance of neighbouring points: as if those around a place filled a disc evenly.

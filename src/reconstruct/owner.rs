@@ -99,8 +99,8 @@ impl Surroundings {
         }
     }
 
-    /// Distance of a point from the centre line; None where that is not near.
-    pub fn distance_mm(&self, p: &Point3<f64>) -> Option<f64> {
+    /// The place of the centre line nearest to a point's cell; None where none is near.
+    fn place(&self, p: &Point3<f64>) -> Option<usize> {
         let at = (p - self.low) / self.cell_mm;
         let inside = (0..3).all(|k| at[k] >= 0.0 && (at[k] as usize) < self.size[k]);
         if !inside {
@@ -108,20 +108,31 @@ impl Surroundings {
         }
         let cell = (at.z as usize * self.size[1] + at.y as usize) * self.size[0] + at.x as usize;
         let place = self.nearest[cell];
-        if place == NOWHERE {
-            return None;
-        }
-        let from = (place as usize).saturating_sub(self.window);
-        let to = (place as usize + self.window).min(self.places.len() - 1);
+        (place != NOWHERE).then_some(place as usize)
+    }
+
+    /// Whether a point is near the centre line, to a cell's size.
+    pub fn is_near(&self, p: &Point3<f64>) -> bool {
+        self.place(p).is_some()
+    }
+
+    /// Distance of a point from the centre line; None where that is not near.
+    pub fn distance_mm(&self, p: &Point3<f64>) -> Option<f64> {
+        let place = self.place(p)?;
+        let from = place.saturating_sub(self.window);
+        let to = (place + self.window).min(self.places.len() - 1);
         let squares = self.places[from..=to].windows(2).map(|edge| square_from(edge, p));
         Some(squares.fold(f64::INFINITY, f64::min).sqrt())
     }
 
     /// Whether a point is the tube's, beside faces that may be there.
     pub fn owns(&self, p: &Point3<f64>, faces: &[Face]) -> bool {
-        let Some(distance) = self.distance_mm(p) else { return false };
-        let on_tube = (distance - self.radius_mm).abs() < SURFACE_SHARE * self.radius_mm;
-        on_tube || !faces.iter().any(|f| f.holds(p))
+        let on_tube = |distance: f64| (distance - self.radius_mm).abs() < SURFACE_SHARE * self.radius_mm;
+        if faces.iter().any(|f| f.holds(p)) {
+            self.distance_mm(p).is_some_and(on_tube)
+        } else {
+            self.is_near(p)
+        }
     }
 
     /// The points of the cloud that are the tube's, ascending.

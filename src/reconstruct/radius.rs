@@ -21,8 +21,8 @@ const SUITS: std::ops::Range<f64> = 0.42..1.05;
 const SCALE_STEP: f64 = 1.8;
 
 /// Places that are looked at to find a candidate and to weigh it.
-const PLACES: usize = 96;
-const JUDGES: usize = 160;
+const PLACES: usize = 72;
+const JUDGES: usize = 90;
 
 /// Radii within this share of each other are one tube's.
 const AGREE: f64 = 0.12;
@@ -40,6 +40,18 @@ const LEAST_SHARE: f64 = 0.5;
 /// Straight enough to tell the radius: weak curvature over strong.
 const STRAIGHT: f64 = 0.08;
 
+/// A radius with this support is what the scan shows.
+const CLEAR_SUPPORT: f64 = 0.7;
+
+/// A tube's radius is less than this share of the scene.
+const WIDEST_SHARE: f64 = 0.25;
+
+/// A candidate's cylinders may be this much less exact than the most exact ones.
+const MOST_OVER_NOISE: f64 = 6.0;
+
+/// Thinning from level to level.
+const LEVEL_STEP: f64 = 1.7;
+
 /// Points of a neighbourhood across, at a scale's thinning.
 const ACROSS: f64 = 5.0;
 
@@ -50,6 +62,8 @@ pub struct Candidate {
     pub radius_mm: f64,
     /// Share of the places that lie on cylinders of this radius.
     pub support: f64,
+    /// Distance of the points from these cylinders, root mean square, at the better places.
+    pub rms_mm: f64,
 }
 
 /// What one scale says of the radius.
@@ -62,37 +76,54 @@ struct Reading {
 /// Radii of tubes in a cloud whose points lie about `spacing_mm` apart, the best supported first; empty when nothing
 /// in the cloud is curved like a tube.
 pub fn candidates(cloud: &PointCloud, spacing_mm: f64) -> Vec<Candidate> {
-    let Some((low, high)) = cloud.bounds() else { return Vec::new() };
-    let diagonal = (high - low).norm();
-    let mut out: Vec<Candidate> = Vec::new();
-    for reading in readings(cloud, spacing_mm, diagonal) {
-        let known = out.iter().any(|c| (c.radius_mm / reading.radius_mm).ln().abs() < 2.0 * AGREE);
-        if known {
-            continue;
-        }
-        if let Some(found) = judge(cloud, reading.radius_mm) {
-            out.push(found);
-        }
+    let coarse = spacing_mm * LEVEL_STEP;
+    let mut out = judged(cloud, &readings(&cloud.thinned(coarse), coarse));
+    // A tube so thin that its points must all be looked at.
+    if out.iter().all(|c| c.support < CLEAR_SUPPORT) {
+        out.extend(judged(cloud, &readings(cloud, spacing_mm)));
     }
+    // One scanner, one noise: what is much farther off its cylinders is no cylinder.
+    let noise = out.iter().map(|c| c.rms_mm).fold(f64::INFINITY, f64::min);
+    out.retain(|c| c.rms_mm <= MOST_OVER_NOISE * noise);
     out.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.radius_mm.total_cmp(&b.radius_mm)));
     out.dedup_by(|b, a| (a.radius_mm / b.radius_mm).ln().abs() < 2.0 * AGREE);
     out
 }
 
+/// The readings that cylinders bear out.
+fn judged(cloud: &PointCloud, readings: &[Reading]) -> Vec<Candidate> {
+    let mut out: Vec<Candidate> = Vec::new();
+    for reading in readings {
+        let known = out.iter().any(|c| (c.radius_mm / reading.radius_mm).ln().abs() < 2.0 * AGREE);
+        if known {
+            continue;
+        }
+        out.extend(judge(cloud, reading.radius_mm));
+        if out.last().is_some_and(|c| c.support > CLEAR_SUPPORT) {
+            break;
+        }
+    }
+    out
+}
+
 /// One reading per scale, the most agreed on first.
-fn readings(cloud: &PointCloud, spacing_mm: f64, diagonal: f64) -> Vec<Reading> {
+fn readings(cloud: &PointCloud, spacing_mm: f64) -> Vec<Reading> {
+    let Some((low, high)) = cloud.bounds() else { return Vec::new() };
+    let widest = (high - low).norm() * WIDEST_SHARE;
     let mut readings = Vec::new();
     let mut scale = 2.0 * spacing_mm;
-    let mut level = cloud.clone();
-    let mut index = Neighbours::new(&level);
+    let mut thinned: Option<PointCloud> = None;
+    let mut index = Neighbours::new(cloud);
     let mut cell = spacing_mm;
-    while scale < diagonal / 3.0 {
-        if scale / ACROSS > 1.5 * cell {
+    while scale < SUITS.end * widest {
+        if scale / ACROSS > LEVEL_STEP * cell {
             cell = scale / ACROSS;
-            level = level.thinned(cell);
-            index = Neighbours::new(&level);
+            let next = thinned.as_ref().unwrap_or(cloud).thinned(cell);
+            index = Neighbours::new(&next);
+            thinned = Some(next);
         }
-        readings.extend(read_at(&level, &index, scale));
+        let level = thinned.as_ref().unwrap_or(cloud);
+        readings.extend(read_at(level, &index, scale).filter(|r| r.radius_mm < widest));
         scale *= SCALE_STEP;
     }
     readings.sort_by(|a: &Reading, b| b.agreeing.total_cmp(&a.agreeing));
@@ -164,7 +195,7 @@ fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
     let work = cloud.thinned(0.13 * radius_mm);
     let index = Neighbours::new(&work);
     let places = places(&work, JUDGES);
-    let fitted: Vec<(f64, bool)> = places
+    let fitted: Vec<(f64, bool, f64)> = places
         .par_iter()
         .map_init(Near::default, |near, p| {
             let reach = JET_RADII * radius_mm;
@@ -173,7 +204,7 @@ fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
             let points = near.within(&work, &index, &start.centre, REACH_RADII * radius_mm);
             let cylinder = fit_cylinder(points, &start, true)?;
             let straight = (jet.weak_per_mm * radius_mm).abs() < STRAIGHT;
-            (cylinder.share > LEAST_SHARE).then_some((cylinder.radius_mm, straight))
+            (cylinder.share > LEAST_SHARE).then_some((cylinder.radius_mm, straight, cylinder.rms_mm))
         })
         .collect::<Vec<_>>()
         .into_iter()
@@ -187,11 +218,13 @@ fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
         return None;
     }
     let window = logs[from].exp()..=logs[from + count - 1].exp();
-    let within = |f: &&(f64, bool)| window.contains(&f.0);
+    let within = |f: &&(f64, bool, f64)| window.contains(&f.0);
     let mut straight: Vec<f64> = fitted.iter().filter(within).filter(|f| f.1).map(|f| f.0).collect();
     let mut all: Vec<f64> = fitted.iter().filter(within).map(|f| f.0).collect();
     let radius_mm = if straight.len() >= 20 { median(&mut straight) } else { median(&mut all) };
-    Some(Candidate { radius_mm: radius_mm?, support })
+    let mut rms: Vec<f64> = fitted.iter().filter(within).map(|f| f.2).collect();
+    rms.sort_by(f64::total_cmp);
+    Some(Candidate { radius_mm: radius_mm?, support, rms_mm: rms[rms.len() / 4] })
 }
 
 /// Median; None without values.

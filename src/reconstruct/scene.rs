@@ -33,7 +33,7 @@ pub struct Scene {
     pub warnings: Vec<String>,
 }
 
-/// Another chain of this share of the longest is another tube, not debris.
+/// Another chain with this share of the largest one's surface is another tube, not debris.
 const SECOND_TUBE_SHARE: f64 = 0.15;
 
 /// More tubes than this and the longest is no better than another.
@@ -51,7 +51,8 @@ const CANDIDATES: usize = 3;
 const LEAST_OF_BEST: f64 = 0.25;
 
 /// Less than this share of the cloud away from the tube is flying points.
-const STRAY_SHARE: f64 = 0.02;
+const STRAY_SHARE: f64 = 0.06;
+const SOME_POINTS: usize = 10_000;
 
 /// A cloud with points farther apart than this many tube radii is taken anew.
 const COARSEST_RADII: f64 = 0.2;
@@ -66,6 +67,8 @@ struct Tube {
     polygon: Vec<Point3<f64>>,
     /// Length without bridges.
     solid_mm: f64,
+    /// Area of the surface seen, about.
+    area_mm2: f64,
     closed: bool,
 }
 
@@ -146,31 +149,34 @@ fn tubes_of(work: &PointCloud, radius_mm: f64) -> Result<Vec<Tube>, ReconstructE
     }
     let tubes: Vec<Tube> = chains
         .into_iter()
-        .filter(|c| on_surface(c, radius_mm, work) >= LEAST_ON_SURFACE)
-        .map(|polygon| Tube {
-            radius_mm,
-            solid_mm: crust::solid_length_mm(&polygon, spacing),
-            closed: crust::is_closed(&polygon, spacing, radius_mm),
-            polygon,
+        .filter_map(|polygon| {
+            let on = on_surface(&polygon, radius_mm, work)?;
+            Some(Tube {
+                radius_mm,
+                solid_mm: crust::solid_length_mm(&polygon, spacing),
+                area_mm2: on as f64 * (WORK_CELL_RADII * radius_mm).powi(2),
+                closed: crust::is_closed(&polygon, spacing, radius_mm),
+                polygon,
+            })
         })
         .collect();
     if tubes.is_empty() { Err(ReconstructError::NoTube { points: work.len() }) } else { Ok(tubes) }
 }
 
-/// Share of the points around a centre line that lie on the tube's surface.
-fn on_surface(polygon: &[Point3<f64>], radius_mm: f64, work: &PointCloud) -> f64 {
+/// Points that lie on the tube's surface; None when too many around the centre line do not.
+fn on_surface(polygon: &[Point3<f64>], radius_mm: f64, work: &PointCloud) -> Option<usize> {
     let around = Surroundings::new(polygon, radius_mm);
     let distances: Vec<f64> = work.iter().filter_map(|p| around.distance_mm(&p)).collect();
     let near = distances.iter().filter(|d| **d < 1.5 * radius_mm).count();
     let on = distances.iter().filter(|d| (**d - radius_mm).abs() < SURFACE_SHARE * radius_mm).count();
-    on as f64 / near.max(1) as f64
+    (on as f64 >= LEAST_ON_SURFACE * near as f64).then_some(on)
 }
 
 /// Adds a tube unless it is one that was found with another radius.
 fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube) {
     let known = tubes.iter().any(|t| {
         let around = Surroundings::new(&t.polygon, t.radius_mm);
-        let inside = tube.polygon.iter().filter(|p| around.distance_mm(p).is_some()).count();
+        let inside = tube.polygon.iter().filter(|p| around.is_near(p)).count();
         2 * inside > tube.polygon.len()
     });
     if !known {
@@ -180,9 +186,9 @@ fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube) {
 
 /// The tube that is wanted, and a warning when there are others.
 fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<String>), ReconstructError> {
-    tubes.sort_by(|a, b| (b.solid_mm * b.radius_mm).total_cmp(&(a.solid_mm * a.radius_mm)));
-    let longest = tubes[0].solid_mm;
-    tubes.retain(|t| t.solid_mm >= SECOND_TUBE_SHARE * longest);
+    tubes.sort_by(|a, b| b.area_mm2.total_cmp(&a.area_mm2));
+    let largest = tubes[0].area_mm2;
+    tubes.retain(|t| t.area_mm2 >= SECOND_TUBE_SHARE * largest);
     let lengths_mm: Vec<f64> = tubes.iter().map(|t| t.solid_mm).collect();
     if tubes.len() > MOST_TUBES && nominal.is_none() {
         return Err(ReconstructError::SeveralTubes { lengths_mm });
@@ -213,16 +219,19 @@ fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<
 fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, warnings: Vec<String>) -> Scene {
     let Tube { radius_mm, polygon, .. } = tube;
     let around = Surroundings::new(&polygon, radius_mm);
-    let near: Vec<usize> =
-        (0..rest.cloud.len()).filter(|&i| around.distance_mm(&rest.cloud.point(i)).is_some()).collect();
-    let alone = faces.is_empty() && near.len() as f64 >= (1.0 - STRAY_SHARE) * rest.cloud.len() as f64;
+    let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
+    // Thinning makes strays many: their share is that among any points.
+    let some = any_share(cloud, SOME_POINTS);
+    let strays = some.iter().filter(|p| !around.is_near(p)).count();
+    let alone = faces.is_empty() && strays as f64 <= STRAY_SHARE * some.len() as f64;
     let own = (!alone).then(|| around.own_points(cloud, &faces));
     let cell = WORK_CELL_RADII * radius_mm;
     let coarse = rest.spacing_mm > COARSEST_RADII * radius_mm;
     let thin = match &own {
         Some(own) if coarse || !faces.is_empty() => {
-            let own: Vec<usize> = own.iter().map(|&i| i as usize).collect();
-            any_share(&cloud.select(&own), 4 * MOST_LOOKED_AT / 10).thinned(cell)
+            let run = own.len().div_ceil(MOST_LOOKED_AT / 5).max(1);
+            let own: Vec<usize> = own.iter().step_by(run).map(|&i| i as usize).collect();
+            cloud.select(&own).thinned(cell)
         }
         _ => rest.cloud.select(&near).thinned(cell),
     };
