@@ -379,3 +379,107 @@ fn sagitta(powers: &[f64; 5], right: &[f64; 3]) -> f64 {
     // A uniform width reaches 1.7 root mean squares to either side.
     solved.map_or(0.0, |c| c[2] * 3.0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reproducible numbers from -0.5 to 0.5.
+    fn numbers(mut state: u64) -> impl FnMut() -> f64 {
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        }
+    }
+
+    /// `n` points on a rectangle about `middle`, with noise of standard deviation `sigma` across.
+    fn sheet(
+        n: usize,
+        middle: Point3<f64>,
+        sides: [Vector3<f64>; 2],
+        sigma: f64,
+        seed: u64,
+    ) -> Vec<Point3<f64>> {
+        let mut next = numbers(seed);
+        let normal = sides[0].cross(&sides[1]).normalize();
+        // The sum of twelve uniform numbers has variance one.
+        let point = |_| {
+            let at = middle + sides[0] * next() + sides[1] * next();
+            at + normal * (sigma * (0..12).map(|_| next()).sum::<f64>())
+        };
+        (0..n).map(point).collect()
+    }
+
+    fn cylinder(n: usize, r: f64, length: f64, sigma: f64) -> Vec<Point3<f64>> {
+        let mut next = numbers(7);
+        let point = |_| {
+            let (turn, along) = (3.0 * next(), length * next());
+            let radius = r + sigma * (0..12).map(|_| next()).sum::<f64>();
+            Point3::new(along, radius * turn.cos(), radius * turn.sin())
+        };
+        (0..n).map(point).collect()
+    }
+
+    #[test]
+    fn a_sheet_comes_out_with_its_normal_and_offset_to_within_noise() {
+        let sides = [Vector3::new(100.0, 20.0, 5.0), Vector3::new(-10.0, 70.0, 30.0)];
+        let normal = sides[0].cross(&sides[1]).normalize();
+        // Far from the origin: nothing may cancel.
+        let middle = Point3::new(5_000.0, -3_000.0, 800.0);
+        let faces = find_planes(&sheet(8_000, middle, sides, 0.05, 1), 1.0);
+        assert_eq!(faces.len(), 1);
+        let face = &faces[0];
+        assert!(face.points.len() > 7_900, "{}", face.points.len());
+        assert!((face.sigma_mm - 0.05).abs() < 0.005, "{}", face.sigma_mm);
+        assert!(face.normal.cross(&normal).norm() < 1e-4, "{}", face.normal.cross(&normal).norm());
+        assert!(face.distance_mm(&middle).abs() < 0.005, "{}", face.distance_mm(&middle));
+    }
+
+    #[test]
+    fn parallel_sheets_are_two_and_each_point_is_one_face_s() {
+        let sides = [Vector3::x() * 80.0, Vector3::y() * 60.0];
+        let mut points = sheet(5_000, Point3::origin(), sides, 0.03, 2);
+        points.extend(sheet(4_000, Point3::new(20.0, 10.0, 2.0), sides, 0.03, 3));
+        let faces = find_planes(&points, 1.0);
+        assert_eq!(faces.len(), 2, "{:?}", faces.iter().map(|f| f.points.len()).collect::<Vec<_>>());
+        let mut all: Vec<u32> = faces.iter().flat_map(|f| f.points.clone()).collect();
+        let many = all.len();
+        all.sort_unstable();
+        all.dedup();
+        assert!(all.len() == many && many > 8_700, "{many}");
+    }
+
+    #[test]
+    fn a_cylinder_has_no_planes_whatever_its_radius_and_noise() {
+        for r in [2.0, 5.0, 12.0, 50.0] {
+            for sigma in [0.0, 0.01, 0.03, 0.1] {
+                let points = cylinder(12_000, r, 20.0 * r, sigma);
+                let spacing = (3.0 * r * 20.0 * r / 12_000.0_f64).sqrt();
+                let faces = find_planes(&points, spacing);
+                assert!(faces.is_empty(), "radius {r}, noise {sigma}: {}", faces[0].points.len());
+            }
+        }
+    }
+
+    #[test]
+    fn a_sheet_beside_a_cylinder_keeps_off_it() {
+        let mut points = cylinder(6_000, 12.0, 300.0, 0.03);
+        let of_tube = points.len() as u32;
+        let sides = [Vector3::x() * 300.0, Vector3::y() * 80.0];
+        points.extend(sheet(6_000, Point3::new(0.0, 0.0, -12.0), sides, 0.03, 4));
+        let faces = find_planes(&points, 1.5);
+        assert_eq!(faces.len(), 1);
+        let taken = faces[0].points.iter().filter(|&&i| i < of_tube).count();
+        // What lies within four sigmas of the tangent plane: a strip of 2 sqrt(2 r 0.12) = 3.4 mm.
+        assert!(taken < 500, "{taken} points of the tube");
+        assert!(faces[0].points.len() - taken > 5_900);
+    }
+
+    #[test]
+    fn nothing_and_next_to_nothing() {
+        assert!(find_planes(&[], 1.0).is_empty());
+        assert!(find_planes(&[Point3::origin(); 100], 1.0).is_empty());
+        assert!(find_planes(&cylinder(500, 5.0, 50.0, 0.0), 0.0).is_empty());
+        assert!(find_planes(&cylinder(5, 5.0, 50.0, 0.0), 3.0).is_empty());
+    }
+}

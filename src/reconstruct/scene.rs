@@ -8,7 +8,7 @@ use nalgebra::Point3;
 
 use super::crust;
 use super::error::ReconstructError;
-use super::mls::{self, SPINE_SPACING_RADII, WORK_CELL_RADII};
+use super::mls::{self, SPINE_SPACING_RADII, SpinePoint, WORK_CELL_RADII};
 use super::moderate::{Moderate, any_share, moderate};
 use super::owner::Surroundings;
 use super::radius::{self, Candidate};
@@ -74,23 +74,29 @@ struct Tube {
 
 /// Finds the tube: with a nominal the one most like it, otherwise the largest.
 pub fn look(cloud: &PointCloud, nominal: Option<&Nominal>) -> Result<Scene, ReconstructError> {
-    let no_tube = || ReconstructError::NoTube { points: cloud.len() };
     let whole = moderate(cloud);
     let faces = planes(&whole);
     let rest = without(cloud, &whole, &faces);
+    let no_tube =
+        || ReconstructError::NoTube { points: cloud.len(), faces: faces.len(), spacing_mm: rest.spacing_mm };
     let candidates = radius::candidates(&rest.cloud, rest.spacing_mm);
     let best = candidates.first().ok_or_else(no_tube)?.support;
     let mut tubes: Vec<Tube> = Vec::new();
-    let mut reason = None;
+    let mut sparse = None;
     for candidate in candidates.iter().take(CANDIDATES).filter(|c| c.support >= LEAST_OF_BEST * best) {
+        let radius_mm = candidate.radius_mm;
         let work = at_radius(cloud, &rest, &faces, candidate);
-        match tubes_of(&work, candidate.radius_mm) {
-            Ok(found) => found.into_iter().for_each(|t| keep_apart(&mut tubes, t)),
-            Err(error) => reason = reason.or(Some(error)),
+        let spine = mls::spine_cloud(&work, radius_mm);
+        let found = tubes_of(&work, &spine, radius_mm);
+        if found.is_empty() && sparse.is_none() && rest.spacing_mm > COARSEST_RADII * radius_mm {
+            let (found, wanted_mm) = (spine.len(), COARSEST_RADII * radius_mm);
+            let points = work.len();
+            sparse = Some(ReconstructError::TooSparse { found, points, radius_mm, wanted_mm });
         }
+        found.into_iter().for_each(|t| keep_apart(&mut tubes, t));
     }
     if tubes.is_empty() {
-        return Err(reason.unwrap_or_else(no_tube));
+        return Err(sparse.unwrap_or_else(no_tube));
     }
     let (tube, warnings) = choose(tubes, nominal)?;
     if tube.closed {
@@ -135,20 +141,12 @@ fn at_radius(cloud: &PointCloud, rest: &Moderate, faces: &[Face], candidate: &Ca
 }
 
 /// The tubes of one radius, the longest first.
-fn tubes_of(work: &PointCloud, radius_mm: f64) -> Result<Vec<Tube>, ReconstructError> {
+fn tubes_of(work: &PointCloud, spine: &[SpinePoint], radius_mm: f64) -> Vec<Tube> {
     let spacing = SPINE_SPACING_RADII * radius_mm;
-    let spine = mls::spine_cloud(work, radius_mm);
-    let found = crust::connect(&mls::condense(&spine, spacing), spacing, radius_mm);
-    let long = |c: &Vec<Point3<f64>>| crust::solid_length_mm(c, spacing) >= LEAST_LENGTH_RADII * radius_mm;
-    let chains: Vec<Vec<Point3<f64>>> =
-        found.into_iter().map(|c| crust::trimmed(c, spacing, radius_mm)).filter(long).collect();
-    if chains.is_empty() {
-        let wanted_mm = 0.2 * radius_mm;
-        let points = work.len();
-        return Err(ReconstructError::TooSparse { found: spine.len(), points, radius_mm, wanted_mm });
-    }
-    let tubes: Vec<Tube> = chains
+    crust::connect(&mls::condense(spine, spacing), spacing, radius_mm)
         .into_iter()
+        .map(|chain| crust::trimmed(chain, spacing, radius_mm))
+        .filter(|c| crust::solid_length_mm(c, spacing) >= LEAST_LENGTH_RADII * radius_mm)
         .filter_map(|polygon| {
             let on = on_surface(&polygon, radius_mm, work)?;
             Some(Tube {
@@ -159,8 +157,7 @@ fn tubes_of(work: &PointCloud, radius_mm: f64) -> Result<Vec<Tube>, ReconstructE
                 polygon,
             })
         })
-        .collect();
-    if tubes.is_empty() { Err(ReconstructError::NoTube { points: work.len() }) } else { Ok(tubes) }
+        .collect()
 }
 
 /// Points that lie on the tube's surface; None when too many around the centre line do not.
