@@ -439,7 +439,7 @@ mod tests {
     fn parallel_sheets_are_two_and_each_point_is_one_face_s() {
         let sides = [Vector3::x() * 80.0, Vector3::y() * 60.0];
         let mut points = sheet(5_000, Point3::origin(), sides, 0.03, 2);
-        points.extend(sheet(4_000, Point3::new(20.0, 10.0, 2.0), sides, 0.03, 3));
+        points.extend(sheet(4_000, Point3::new(20.0, 10.0, 20.0), sides, 0.03, 3));
         let faces = find_planes(&points, 1.0);
         assert_eq!(faces.len(), 2, "{:?}", faces.iter().map(|f| f.points.len()).collect::<Vec<_>>());
         let mut all: Vec<u32> = faces.iter().flat_map(|f| f.points.clone()).collect();
