@@ -40,7 +40,7 @@ pub fn moderate(cloud: &PointCloud) -> Moderate {
     let mut spacing_mm = (area_mm2(&any_share(&share, PROBE_POINTS)) / ENOUGH_POINTS as f64).sqrt();
     let mut out = share.thinned(spacing_mm);
     // On a tube thinner than the probe's cells the area comes out too large.
-    while out.len() < ENOUGH_POINTS / 3 && out.len() < share.len() / 2 {
+    while out.len() < ENOUGH_POINTS / 2 && out.len() < share.len() / 2 {
         spacing_mm *= (out.len() as f64 / ENOUGH_POINTS as f64).sqrt();
         out = share.thinned(spacing_mm);
     }

@@ -50,6 +50,9 @@ const SURFACE_SHARE: f64 = 0.15;
 const CANDIDATES: usize = 3;
 const LEAST_OF_BEST: f64 = 0.25;
 
+/// With this support a radius is a tube's, even where its points are too few for a centre line.
+const SURE_SUPPORT: f64 = 0.3;
+
 /// Less than this share of the cloud away from the tube is flying points.
 const STRAY_SHARE: f64 = 0.06;
 const SOME_POINTS: usize = 10_000;
@@ -88,7 +91,8 @@ pub fn look(cloud: &PointCloud, nominal: Option<&Nominal>) -> Result<Scene, Reco
         let work = at_radius(cloud, &rest, &faces, candidate);
         let spine = mls::spine_cloud(&work, radius_mm);
         let found = tubes_of(&work, &spine, radius_mm);
-        if found.is_empty() && sparse.is_none() && rest.spacing_mm > COARSEST_RADII * radius_mm {
+        let coarse = rest.spacing_mm > COARSEST_RADII * radius_mm && candidate.support > SURE_SUPPORT;
+        if found.is_empty() && sparse.is_none() && coarse {
             let (found, wanted_mm) = (spine.len(), COARSEST_RADII * radius_mm);
             let points = work.len();
             sparse = Some(ReconstructError::TooSparse { found, points, radius_mm, wanted_mm });
