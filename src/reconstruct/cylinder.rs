@@ -150,9 +150,9 @@ impl Sums {
                 }
             }
             let first = [wu, wv, l * wu, l * wv];
-            for k in 0..4 {
-                sums.first[k] += first[k];
-                sums.right[k] += first[k] * residual;
+            for (k, value) in first.iter().enumerate() {
+                sums.first[k] += value;
+                sums.right[k] += value * residual;
             }
             sums.residual += w * residual;
             sums.square += w * residual * residual;

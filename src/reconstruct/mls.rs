@@ -19,7 +19,7 @@ pub const WORK_CELL_RADII: f64 = 0.15;
 const SEED_CELL_RADII: f64 = 0.5;
 
 /// Distance of the places at which cylinders are fitted, in tube radii.
-const GUESS_SPACING_RADII: f64 = 0.25;
+const GUESS_SPACING_RADII: f64 = 0.2;
 
 /// Curvatures that differ more are something else's and say nothing of the noise.
 const MOST_ERROR: f64 = 0.5;

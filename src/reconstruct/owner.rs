@@ -25,7 +25,7 @@ const CELL_RADII: f64 = 0.5;
 const NOWHERE: u32 = u32::MAX;
 
 /// The space around a centre line, in cells that know their nearest place of it.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Surroundings {
     radius_mm: f64,
     /// The centre line in steps of about half a cell, drawn out a radius at both ends.

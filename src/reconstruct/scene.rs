@@ -23,7 +23,7 @@ pub struct Scene {
     pub radius_mm: f64,
     /// Vertices along the centre line, about 0.3 tube radii apart except across gaps.
     pub polygon: Vec<Point3<f64>>,
-    /// The tube's points, thinned to about 0.15 tube radii.
+    /// The tube's points: all, or so many that they lie 0.2 tube radii apart or closer.
     pub thin: PointCloud,
     /// Indices of the cloud's points that are the tube's, ascending; None when nothing else was seen: all are.
     pub own: Option<Vec<u32>>,
@@ -68,6 +68,7 @@ const MOST_LOOKED_AT: usize = 2_000_000;
 struct Tube {
     radius_mm: f64,
     polygon: Vec<Point3<f64>>,
+    around: Surroundings,
     /// Length without bridges.
     solid_mm: f64,
     /// Area of the surface seen, about.
@@ -152,9 +153,11 @@ fn tubes_of(work: &PointCloud, spine: &[SpinePoint], radius_mm: f64) -> Vec<Tube
         .map(|chain| crust::trimmed(chain, spacing, radius_mm))
         .filter(|c| crust::solid_length_mm(c, spacing) >= LEAST_LENGTH_RADII * radius_mm)
         .filter_map(|polygon| {
-            let on = on_surface(&polygon, radius_mm, work)?;
+            let around = Surroundings::new(&polygon, radius_mm);
+            let on = on_surface(&around, radius_mm, work)?;
             Some(Tube {
                 radius_mm,
+                around,
                 solid_mm: crust::solid_length_mm(&polygon, spacing),
                 area_mm2: on as f64 * (WORK_CELL_RADII * radius_mm).powi(2),
                 closed: crust::is_closed(&polygon, spacing, radius_mm),
@@ -165,8 +168,7 @@ fn tubes_of(work: &PointCloud, spine: &[SpinePoint], radius_mm: f64) -> Vec<Tube
 }
 
 /// Points that lie on the tube's surface; None when too many around the centre line do not.
-fn on_surface(polygon: &[Point3<f64>], radius_mm: f64, work: &PointCloud) -> Option<usize> {
-    let around = Surroundings::new(polygon, radius_mm);
+fn on_surface(around: &Surroundings, radius_mm: f64, work: &PointCloud) -> Option<usize> {
     let distances: Vec<f64> = work.iter().filter_map(|p| around.distance_mm(&p)).collect();
     let near = distances.iter().filter(|d| **d < 1.5 * radius_mm).count();
     let on = distances.iter().filter(|d| (**d - radius_mm).abs() < SURFACE_SHARE * radius_mm).count();
@@ -176,8 +178,7 @@ fn on_surface(polygon: &[Point3<f64>], radius_mm: f64, work: &PointCloud) -> Opt
 /// Adds a tube unless it is one that was found with another radius.
 fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube) {
     let known = tubes.iter().any(|t| {
-        let around = Surroundings::new(&t.polygon, t.radius_mm);
-        let inside = tube.polygon.iter().filter(|p| around.is_near(p)).count();
+        let inside = tube.polygon.iter().filter(|p| t.around.is_near(p)).count();
         2 * inside > tube.polygon.len()
     });
     if !known {
@@ -218,23 +219,21 @@ fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<
 
 /// Tells the tube's points from the others.
 fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, warnings: Vec<String>) -> Scene {
-    let Tube { radius_mm, polygon, .. } = tube;
-    let around = Surroundings::new(&polygon, radius_mm);
+    let Tube { radius_mm, polygon, around, .. } = tube;
     let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
     // Thinning makes strays many: their share is that among any points.
     let some = any_share(cloud, SOME_POINTS);
     let strays = some.iter().filter(|p| !around.is_near(p)).count();
     let alone = faces.is_empty() && strays as f64 <= STRAY_SHARE * some.len() as f64;
     let own = (!alone).then(|| around.own_points(cloud, &faces));
-    let cell = WORK_CELL_RADII * radius_mm;
     let coarse = rest.spacing_mm > COARSEST_RADII * radius_mm;
     let thin = match &own {
         Some(own) if coarse || !faces.is_empty() => {
             let run = own.len().div_ceil(MOST_LOOKED_AT / 5).max(1);
             let own: Vec<usize> = own.iter().step_by(run).map(|&i| i as usize).collect();
-            cloud.select(&own).thinned(cell)
+            cloud.select(&own)
         }
-        _ => rest.cloud.select(&near).thinned(cell),
+        _ => rest.cloud.select(&near),
     };
     Scene { radius_mm, polygon, thin, own, faces, warnings }
 }
