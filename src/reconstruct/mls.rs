@@ -84,25 +84,38 @@ pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
 type Projected = (SpinePoint, f64);
 
 /// Two tubes cannot be nearer than two radii: of spine points that lie side by side only the better borne out stay.
-fn strongest(mut found: Vec<Projected>, radius_mm: f64) -> Vec<SpinePoint> {
-    found.sort_by(|a, b| b.1.total_cmp(&a.1));
+fn strongest(found: Vec<Projected>, radius_mm: f64) -> Vec<SpinePoint> {
+    let mut order: Vec<usize> = (0..found.len()).collect();
+    order.sort_by(|&a, &b| found[b].1.total_cmp(&found[a].1).then(a.cmp(&b)));
     let points: Vec<Point3<f64>> = found.iter().map(|f| f.0.point).collect();
     let index = Neighbours::new(&PointCloud::from_points(&points));
-    let mut dropped = vec![false; found.len()];
+    let mut state = vec![Stand::Open; found.len()];
     let mut near = Vec::new();
-    for (i, (spine, _)) in found.iter().enumerate() {
-        if dropped[i] {
+    for i in order {
+        if state[i] == Stand::Dropped {
             continue;
         }
+        state[i] = Stand::Stays;
+        let spine = &found[i].0;
         index.within(&spine.point, APART_RADII * radius_mm, &mut near);
-        for &k in near.iter().filter(|&&k| k as usize > i) {
-            let gap = (points[k as usize] - spine.point) / radius_mm;
+        for k in near.iter().map(|&k| k as usize) {
+            let gap = (points[k] - spine.point) / radius_mm;
             let along = gap.dot(&spine.tangent);
             let aside = (gap.norm_squared() - along * along).max(0.0).sqrt();
-            dropped[k as usize] |= aside > ASIDE_RADII + TIGHTEST_RADII * along * along;
+            if state[k] == Stand::Open && aside > ASIDE_RADII + TIGHTEST_RADII * along * along {
+                state[k] = Stand::Dropped;
+            }
         }
     }
-    found.iter().zip(dropped).filter(|(_, d)| !d).map(|(f, _)| f.0).collect()
+    found.iter().zip(state).filter(|(_, s)| *s == Stand::Stays).map(|(f, _)| f.0).collect()
+}
+
+/// What is known of a spine point beside others.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Stand {
+    Open,
+    Stays,
+    Dropped,
 }
 
 /// One projection: a cylinder from the guessed axis, and the outlier rules.
