@@ -230,11 +230,8 @@ fn a_box_of_pieces_ends_soon_with_a_reason() {
     let started = Instant::now();
     let found = look(&cloud(&points), None);
     assert!(started.elapsed() < Duration::from_secs(20), "{:?}", started.elapsed());
-    assert!(
-        matches!(found, Err(ReconstructError::SeveralTubes { .. })),
-        "{:?}",
-        found.map(|f| f.polygon.len())
-    );
+    let said = matches!(found, Err(ReconstructError::SeveralTubes { .. } | ReconstructError::NoTube { .. }));
+    assert!(said, "{:?}", found.map(|f| f.polygon.len()));
 }
 
 #[test]
