@@ -2,7 +2,8 @@
 //!
 //! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
 //! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, polygon by
-//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), least squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
+//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), least
+//! squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
 
 pub mod apollonius;
 pub mod arcline;
