@@ -36,38 +36,80 @@ pub fn fit_jet(point: &Point3<f64>, neighbours: &[Point3<f64>], radius_mm: f64) 
         let t = (q - point).norm_squared() / (radius_mm * radius_mm);
         (1.0 - t).max(0.0).powi(2)
     };
-    let frame = tangent_frame(neighbours, weight)?;
+    let frame = tangent_frame(point, neighbours, weight)?;
     // Unit of length: the neighbourhood's radius, so that the normal equations are well scaled.
-    let (mut normal_matrix, mut right) = (Matrix6::zeros(), Vector6::zeros());
-    let (mut square_z, mut total) = (0.0, 0.0);
+    let axes: [Vector3<f64>; 3] = std::array::from_fn(|k| frame.column(k) / radius_mm);
+    // Moments of x and y by their powers, weighted; and of z times those up to second order.
+    let (mut m, mut z) = ([0.0; 15], [0.0; 6]);
+    let mut square_z = 0.0;
     for q in neighbours {
         let w = weight(q);
-        let local = frame.tr_mul(&(q - point)) / radius_mm;
-        let (x, y, z) = (local.x, local.y, local.z);
-        let row = Vector6::new(x * x, y * y, x * y, x, y, 1.0);
-        normal_matrix.syger(w, &row, &row, 1.0);
-        right += row * (w * z);
-        square_z += w * z * z;
-        total += w;
+        let d = q - point;
+        let (x, y, height) = (d.dot(&axes[0]), d.dot(&axes[1]), d.dot(&axes[2]));
+        let (xx, xy, yy) = (x * x, x * y, y * y);
+        let (wx, wy, wxx, wxy, wyy) = (w * x, w * y, w * xx, w * xy, w * yy);
+        let terms = [
+            wxx * xx,
+            wxx * xy,
+            wxx * yy,
+            wxy * yy,
+            wyy * yy, //
+            wxx * x,
+            wxx * y,
+            wyy * x,
+            wyy * y, //
+            wxx,
+            wxy,
+            wyy,
+            wx,
+            wy,
+            w,
+        ];
+        for k in 0..15 {
+            m[k] += terms[k];
+        }
+        for (sum, term) in z.iter_mut().zip([wxx, wyy, wxy, wx, wy, w]) {
+            *sum += term * height;
+        }
+        square_z += w * height * height;
     }
-    normal_matrix.fill_upper_triangle_with_lower_triangle();
+    let [x4, x3y, x2y2, xy3, y4, x3, x2y, xy2, y3, x2, xy, y2, x, y, total] = m;
+    let normal_matrix = Matrix6::new(
+        x4, x2y2, x3y, x3, x2y, x2, //
+        x2y2, y4, xy3, xy2, y3, y2, //
+        x3y, xy3, x2y2, x2y, xy2, xy, //
+        x3, xy2, x2y, x2, xy, x, //
+        x2y, y3, xy2, xy, y2, y, //
+        x2, y2, xy, x, y, total,
+    );
+    let right = Vector6::from(z);
     let c = normal_matrix.cholesky()?.solve(&right);
     let rms_mm = ((square_z - c.dot(&right)).max(0.0) / total).sqrt() * radius_mm;
     shape_operator(point, &frame, &c, radius_mm, rms_mm)
 }
 
 /// Columns: two tangents and the normal, by principal component analysis.
-fn tangent_frame(neighbours: &[Point3<f64>], weight: impl Fn(&Point3<f64>) -> f64) -> Option<Matrix3<f64>> {
-    let total: f64 = neighbours.iter().map(&weight).sum();
+fn tangent_frame(
+    point: &Point3<f64>,
+    neighbours: &[Point3<f64>],
+    weight: impl Fn(&Point3<f64>) -> f64,
+) -> Option<Matrix3<f64>> {
+    let (mut total, mut first, mut second) = (0.0, Vector3::zeros(), [0.0; 6]);
+    for q in neighbours {
+        let (w, d) = (weight(q), q - point);
+        let wd = d * w;
+        total += w;
+        first += wd;
+        let products = [wd.x * d.x, wd.x * d.y, wd.x * d.z, wd.y * d.y, wd.y * d.z, wd.z * d.z];
+        for k in 0..6 {
+            second[k] += products[k];
+        }
+    }
     if total <= 0.0 {
         return None;
     }
-    let mean: Vector3<f64> = neighbours.iter().map(|q| q.coords * weight(q)).sum::<Vector3<f64>>() / total;
-    let mut covariance = Matrix3::zeros();
-    for q in neighbours {
-        let d = q.coords - mean;
-        covariance += d * d.transpose() * weight(q);
-    }
+    let [xx, xy, xz, yy, yz, zz] = second;
+    let covariance = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz) - first * first.transpose() / total;
     let eigen = SymmetricEigen::new(covariance);
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));

@@ -1,7 +1,9 @@
-//! Local geometry of a cloud: jets, that is normals and the shape operator at a point.
+//! Local geometry of a cloud: jets, that is normals and the shape operator at a point; and planar faces.
 //!
-//! Between `cloud` and `reconstruct`: it looks at one neighbourhood at a time and knows nothing of tubes.
+//! Between `cloud` and `reconstruct`: it knows surfaces, and nothing of tubes.
 
 mod jet;
+mod planes;
 
 pub use jet::{Jet, MIN_NEIGHBOURS, fit_jet};
+pub use planes::{Face, find_planes};

@@ -7,6 +7,7 @@ use super::fit::invert;
 use super::measure::{Ends, Values, jacobian, values};
 use super::model::TubeModel;
 use super::moments::Sample;
+use super::normal::equations;
 
 /// A cut-off that no residual reaches: all points count in full.
 const NO_CUTOFF_MM: f64 = 1e9;
@@ -34,7 +35,7 @@ pub struct Bound {
 pub fn cramer_rao(truth: &TubeModel, points: Vec<Point3<f64>>, noise_mm: f64) -> Bound {
     let parameters = truth.parameters();
     let pass = Sample::new(points, truth).pass(truth, NO_CUTOFF_MM);
-    let (normal, _) = pass.normal_equations(&truth.motions(&parameters), &parameters);
+    let (normal, _) = equations(&pass.moments, &truth, &parameters);
     let ends = Ends::default();
     let jacobian = jacobian(truth, &parameters, &ends);
     let covariance = &jacobian * invert(&normal) * jacobian.transpose();

@@ -4,6 +4,8 @@
 //! Every point is joined to its nearest neighbour and to the nearest one on the other side. Edges that both
 //! ends want make paths; paths are then joined end to end across what the scanner did not see.
 
+use std::collections::BinaryHeap;
+
 use nalgebra::{Point3, Vector3};
 
 use super::mls::SpinePoint;
@@ -18,14 +20,8 @@ const REACH_SPACINGS: f64 = 4.0;
 /// Neighbours that may be the nearest and the half neighbour.
 const LOOKED_AT: usize = 24;
 
-/// What the spine points form.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Chains {
-    /// Polygons, the longest first.
-    pub chains: Vec<Vec<Point3<f64>>>,
-    /// Whether the longest closes on itself.
-    pub closed: bool,
-}
+/// Ends near an end that may be across a gap from it.
+const ENDS_LOOKED_AT: usize = 48;
 
 /// Length of a polygon without its bridges: what was really seen.
 pub fn solid_length_mm(chain: &[Point3<f64>], spacing_mm: f64) -> f64 {
@@ -37,21 +33,45 @@ pub fn length_mm(chain: &[Point3<f64>]) -> f64 {
     chain.windows(2).map(|w| (w[1] - w[0]).norm()).sum()
 }
 
-/// Joins points spaced by about `spacing_mm` on a tube of radius `radius_mm`.
-pub fn connect(points: &[SpinePoint], spacing_mm: f64, radius_mm: f64) -> Chains {
+/// Whether a chain ends where it began: nearer than two ends of tubes can come.
+pub fn is_closed(chain: &[Point3<f64>], spacing_mm: f64, radius_mm: f64) -> bool {
+    let (Some(first), Some(last)) = (chain.first(), chain.last()) else { return false };
+    (last - first).norm() < REACH_SPACINGS * spacing_mm && length_mm(chain) > 6.0 * radius_mm
+}
+
+/// A chain without scraps at its ends: what is shorter than the gap before it, and than a tube radius, is no
+/// continuation that anyone could vouch for.
+pub fn trimmed(chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
+    let reach = REACH_SPACINGS * spacing_mm;
+    let mut parts: Vec<&[Point3<f64>]> = chain.chunk_by(|a, b| (b - a).norm() < reach).collect();
+    let scrap = |end: &[Point3<f64>], gap: f64| length_mm(end) < gap.min(radius_mm);
+    while let [.., before, last] = parts[..]
+        && scrap(last, (last[0] - before[before.len() - 1]).norm())
+    {
+        parts.pop();
+    }
+    while let [first, after, ..] = parts[..]
+        && scrap(first, (after[0] - first[first.len() - 1]).norm())
+    {
+        parts.remove(0);
+    }
+    parts.concat()
+}
+
+/// Joins points spaced by about `spacing_mm` on tubes of radius `radius_mm` to polygons, the longest first.
+pub fn connect(points: &[SpinePoint], spacing_mm: f64, radius_mm: f64) -> Vec<Vec<Point3<f64>>> {
     let wanted = wanted_edges(points, REACH_SPACINGS * spacing_mm);
     let mutual = |a: usize, b: usize| wanted[a].contains(&Some(b)) && wanted[b].contains(&Some(a));
     let links: Vec<Vec<usize>> = (0..points.len())
         .map(|a| wanted[a].iter().flatten().copied().filter(|&b| mutual(a, b)).collect())
         .collect();
-    let (mut pieces, closed) = walk(&links);
-    let closed = closed && pieces.len() == 1;
+    let mut pieces = walk(&links);
     join_ends(points, &mut pieces, radius_mm);
     let mut chains: Vec<Vec<Point3<f64>>> =
         pieces.into_iter().map(|piece| piece.into_iter().map(|i| points[i].point).collect()).collect();
     let solid = |c: &Vec<Point3<f64>>| solid_length_mm(c, spacing_mm);
     chains.sort_by(|a, b| solid(b).total_cmp(&solid(a)));
-    Chains { chains, closed }
+    chains
 }
 
 /// Nearest neighbour and half neighbour of every point, no farther than `reach_mm`.
@@ -70,18 +90,15 @@ fn wanted_edges(points: &[SpinePoint], reach_mm: f64) -> Vec<[Option<usize>; 2]>
     (0..points.len()).map(edges).collect()
 }
 
-/// Paths of a graph whose nodes have at most two links; true when one of them was a circle (opened where it was
-/// entered).
-fn walk(links: &[Vec<usize>]) -> (Vec<Vec<usize>>, bool) {
+/// Paths of a graph whose nodes have at most two links; a circle is opened where it is entered.
+fn walk(links: &[Vec<usize>]) -> Vec<Vec<usize>> {
     let mut seen = vec![false; links.len()];
     let mut paths = Vec::new();
-    let mut closed = false;
     let ends = (0..links.len()).filter(|&i| links[i].len() < 2);
     for start in ends.chain(0..links.len()) {
         if seen[start] {
             continue;
         }
-        closed |= links[start].len() == 2;
         let mut path = Vec::new();
         let mut at = Some(start);
         while let Some(i) = at {
@@ -91,33 +108,112 @@ fn walk(links: &[Vec<usize>]) -> (Vec<Vec<usize>>, bool) {
         }
         paths.push(path);
     }
-    (paths, closed)
+    paths
+}
+
+/// An end of a piece, and whether it is the last of its points. A single point has two.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct End {
+    piece: usize,
+    last: bool,
 }
 
 /// Joins path ends across gaps, the cheapest first, while both ends point across. Single points join too.
+///
+/// Only ends among each other's nearest are looked at, so the cost is about linear in the number of pieces. A bridge's
+/// cost can only rise by what was joined before (a single point gets a direction), so a bridge is weighed
+/// again when its turn comes.
 fn join_ends(points: &[SpinePoint], pieces: &mut Vec<Vec<usize>>, radius_mm: f64) {
-    loop {
-        let mut best: Option<(f64, usize, bool, usize, bool)> = None;
-        for a in 0..pieces.len() {
-            for b in a + 1..pieces.len() {
-                for (end_a, end_b) in [(false, false), (false, true), (true, false), (true, true)] {
-                    let cost = gap_cost(points, (&pieces[a], end_a), (&pieces[b], end_b), radius_mm);
-                    if cost.is_some_and(|c| best.is_none_or(|(least, ..)| c < least)) {
-                        best = cost.map(|c| (c, a, end_a, b, end_b));
-                    }
-                }
-            }
+    let mut bridges = possible_bridges(points, pieces, radius_mm);
+    // Where each original end is now; None once it lies inside a piece.
+    let mut home: Vec<[Option<End>; 2]> = (0..pieces.len())
+        .map(|piece| [Some(End { piece, last: false }), Some(End { piece, last: true })])
+        .collect();
+    while let Some(std::cmp::Reverse((Cost(old), a, b))) = bridges.pop() {
+        let now = |end: End| home[end.piece][usize::from(end.last)];
+        let (Some(at_a), Some(at_b)) = (now(a), now(b)) else { continue };
+        if at_a.piece == at_b.piece {
+            continue;
         }
-        let Some((_, a, end_a, b, end_b)) = best else { return };
-        let mut tail = pieces.remove(b);
-        if end_b {
+        let side = |end: End| (pieces[end.piece].as_slice(), end.last);
+        let Some(cost) = gap_cost(points, side(at_a), side(at_b), radius_mm) else { continue };
+        if cost > old {
+            bridges.push(std::cmp::Reverse((Cost(cost), a, b)));
+            continue;
+        }
+        let mut tail = std::mem::take(&mut pieces[at_b.piece]);
+        if at_b.last {
             tail.reverse();
         }
-        if !end_a {
-            pieces[a].reverse();
+        if !at_a.last {
+            pieces[at_a.piece].reverse();
         }
-        pieces[a].append(&mut tail);
+        pieces[at_a.piece].append(&mut tail);
+        settle(&mut home, at_a, at_b);
     }
+    pieces.retain(|p| !p.is_empty());
+}
+
+/// Says where the ends are after the piece of `b` was put behind that of `a`, at these ends.
+fn settle(home: &mut [[Option<End>; 2]], a: End, b: End) {
+    for end in home.iter_mut().flatten() {
+        let Some(at) = *end else { continue };
+        if at == a || at == b {
+            *end = None;
+        } else if at.piece == a.piece {
+            *end = Some(End { piece: a.piece, last: false });
+        } else if at.piece == b.piece {
+            *end = Some(End { piece: a.piece, last: true });
+        }
+    }
+}
+
+/// A cost with an order.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Cost(f64);
+
+impl Eq for Cost {}
+
+impl PartialOrd for Cost {
+    fn partial_cmp(&self, other: &Cost) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Cost {
+    fn cmp(&self, other: &Cost) -> std::cmp::Ordering {
+        self.0.total_cmp(&other.0)
+    }
+}
+
+/// Bridges between ends, the cheapest on top.
+type Bridges = BinaryHeap<std::cmp::Reverse<(Cost, End, End)>>;
+
+fn possible_bridges(points: &[SpinePoint], pieces: &[Vec<usize>], radius_mm: f64) -> Bridges {
+    let ends: Vec<(End, usize)> = pieces
+        .iter()
+        .enumerate()
+        .flat_map(|(piece, p)| {
+            [(End { piece, last: false }, p[0]), (End { piece, last: true }, p[p.len() - 1])]
+        })
+        .collect();
+    let positions: Vec<Point3<f64>> = ends.iter().map(|e| points[e.1].point).collect();
+    let index = Neighbours::new(&PointCloud::from_points(&positions));
+    let mut bridges = Bridges::new();
+    for (i, &(a, _)) in ends.iter().enumerate() {
+        for (k, distance) in index.nearest(&positions[i], ENDS_LOOKED_AT) {
+            let (b, _) = ends[k as usize];
+            if distance > GAP_RADII * radius_mm || a.piece == b.piece {
+                continue;
+            }
+            let (a, b) = (a.min(b), a.max(b));
+            let side = |end: End| (pieces[end.piece].as_slice(), end.last);
+            if let Some(cost) = gap_cost(points, side(a), side(b), radius_mm) {
+                bridges.push(std::cmp::Reverse((Cost(cost), a, b)));
+            }
+        }
+    }
+    bridges
 }
 
 /// Cost of a bridge between two ends (`true`: the last point of the piece); None when it may not be.
@@ -174,10 +270,10 @@ mod tests {
             let ordered = on_circle((0..150).map(|i| i as f64 * 0.03 + 0.008 * (i as f64 * 1.7).sin()));
             let points: Vec<SpinePoint> = shuffle.iter().map(|&i| ordered[i]).collect();
             let chains = connect(&points, 3.0, 10.0);
-            prop_assert_eq!(chains.chains.len(), 1);
-            prop_assert!(!chains.closed);
+            prop_assert_eq!(chains.len(), 1);
+            prop_assert!(!is_closed(&chains[0], 3.0, 10.0));
             let expected: Vec<Point3<f64>> = ordered.iter().map(|s| s.point).collect();
-            let mut found = chains.chains[0].clone();
+            let mut found = chains[0].clone();
             if found[0] != expected[0] {
                 found.reverse();
             }
@@ -189,11 +285,11 @@ mod tests {
     fn a_gap_is_bridged_and_two_curves_stay_two() {
         let gap = on_circle((0..100).filter(|i| !(40..60).contains(i)).map(|i| i as f64 * 0.03));
         let chains = connect(&gap, 3.0, 10.0);
-        assert_eq!(chains.chains.len(), 1);
+        assert_eq!(chains.len(), 1);
         let mut two = on_circle((0..50).map(|i| i as f64 * 0.03));
         let moved = two.clone().into_iter().map(|s| SpinePoint { point: s.point + Vector3::z() * 50.0, ..s });
         two.extend(moved);
-        assert_eq!(connect(&two, 3.0, 10.0).chains.len(), 2);
+        assert_eq!(connect(&two, 3.0, 10.0).len(), 2);
     }
 
     #[test]
@@ -203,6 +299,6 @@ mod tests {
             .into_iter()
             .map(|s| SpinePoint { point: Point3::new(s.point.x, s.point.y, 0.0), ..s })
             .collect();
-        assert!(connect(&flat, 3.2, 10.0).closed);
+        assert!(is_closed(&connect(&flat, 3.2, 10.0)[0], 3.2, 10.0));
     }
 }

@@ -1,7 +1,7 @@
 //! Weighted least-squares fit of a cylinder with a moving centre: the elementary step of the spine's
 //! reconstruction (paper 000, section 3).
 
-use nalgebra::{Matrix5, Point3, Vector3, Vector5};
+use nalgebra::{Matrix5, Point3, Vector2, Vector3, Vector5};
 
 /// A local cylinder.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,6 +19,8 @@ pub struct Cylinder {
     /// How far around it its points reach: 1 less the length of their mean normal, 0 for a single line, 1 all around.
     /// A cylinder on the wrong side of a surface only touches it along a narrow strip.
     pub opening: f64,
+    /// Share of the points around its centre that count: little where something else lies beside the tube.
+    pub share: f64,
 }
 
 /// Support of the weights around the centre in tube radii: a piece of tube about 1.3 radii long (paper 000,
@@ -28,41 +30,48 @@ const SUPPORT_RADII: f64 = 1.2;
 impl Cylinder {
     /// A first guess: a point near the axis and its direction.
     pub fn guess(centre: Point3<f64>, axis: Vector3<f64>, radius_mm: f64) -> Cylinder {
-        Cylinder { centre, axis, radius_mm, rms_mm: 0.0, count: 0, opening: 0.0 }
+        Cylinder { centre, axis, radius_mm, rms_mm: 0.0, count: 0, opening: 0.0, share: 0.0 }
     }
 }
 
 /// Points that a fit needs to see around the first guess of its centre, in tube radii.
-pub const REACH_RADII: f64 = 1.5;
+pub const REACH_RADII: f64 = 1.4;
 
 /// Points farther from the cylinder than this share of its radius do not count (paper 000, section 7).
 const OUTLIER_RADII: f64 = 0.1;
 
-const STEPS: usize = 12;
+/// Steps at most; the first ones look wide, so that a poor start can be left.
+const STEPS: usize = 10;
+const WIDE_STEPS: usize = 2;
+
+/// A step smaller than this share of the radius is the last.
+const SETTLED_RADII: f64 = 2e-4;
 
 /// Fits a cylinder to the points around a starting axis; with `free_radius` its radius too. None when the points do
 /// not determine it or the axis runs away from its start.
 pub fn fit_cylinder(points: &[Point3<f64>], start: &Cylinder, free_radius: bool) -> Option<Cylinder> {
     let mut at = *start;
     for step in 0..STEPS {
-        // Wide at first, so that a poor start can be left.
-        let outlier = at.radius_mm * if step < 3 { 3.0 * OUTLIER_RADII } else { OUTLIER_RADII };
-        let sums = Sums::over(points, &at, outlier);
+        let wide = step < WIDE_STEPS;
+        let outlier = at.radius_mm * if wide { 3.0 * OUTLIER_RADII } else { OUTLIER_RADII };
+        let (u, v) = across(&at.axis);
+        let sums = Sums::over(points, &at, (&u, &v), outlier);
         if sums.count < crate::recognize::MIN_NEIGHBOURS {
             return None;
         }
         let change = sums.solve(free_radius)?;
-        let (u, v) = across(&at.axis);
         let scale = at.radius_mm;
         let axis = (at.axis + (u * change[2] + v * change[3]) / scale).normalize();
         let through = at.centre + u * change[0] + v * change[1];
+        let normals = Vector2::new(sums.first[0], sums.first[1]);
         at = Cylinder {
             centre: through + axis * (start.centre - through).dot(&axis),
             axis,
             radius_mm: at.radius_mm + change[4],
             rms_mm: (sums.square / sums.weight).sqrt(),
             count: sums.count,
-            opening: 1.0 - sums.normals.norm() / sums.weight,
+            opening: 1.0 - normals.norm() / sums.weight,
+            share: sums.count as f64 / sums.seen as f64,
         };
         let sane = at.radius_mm > 0.5 * start.radius_mm && at.radius_mm < 2.0 * start.radius_mm;
         let stays =
@@ -70,7 +79,7 @@ pub fn fit_cylinder(points: &[Point3<f64>], start: &Cylinder, free_radius: bool)
         if !(sane && stays) {
             return None;
         }
-        if step > 3 && change.amax() < 1e-5 * scale {
+        if !wide && change.amax() < SETTLED_RADII * scale {
             break;
         }
     }
@@ -84,57 +93,109 @@ fn across(axis: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     (u, axis.cross(&u))
 }
 
-/// Normal equations of one Gauss-Newton step: shift and tilt across the axis, radius.
+/// Normal equations of one Gauss-Newton step. A row is minus (m, l m, 1): m the normal across the axis (two values), l
+/// the lever along it in radii; so products of m, weighted with 1, l and l squared, are all that is needed.
 #[derive(Default)]
 struct Sums {
-    normal: Matrix5<f64>,
-    right: Vector5<f64>,
-    weight: f64,
+    /// `m m^T` (uu, uv, vv) times 1, l, l^2.
+    products: [[f64; 3]; 3],
+    /// m and l m.
+    first: [f64; 4],
+    /// The same times the residual.
+    right: [f64; 4],
+    /// Residuals.
+    residual: f64,
     square: f64,
-    normals: Vector3<f64>,
+    weight: f64,
     count: usize,
+    /// Points in the support that are not far outside the tube.
+    seen: usize,
 }
 
 impl Sums {
-    fn over(points: &[Point3<f64>], at: &Cylinder, outlier_mm: f64) -> Sums {
-        let (u, v) = across(&at.axis);
-        let support = (SUPPORT_RADII * at.radius_mm).powi(2);
+    fn over(
+        points: &[Point3<f64>],
+        at: &Cylinder,
+        (u, v): (&Vector3<f64>, &Vector3<f64>),
+        outlier_mm: f64,
+    ) -> Sums {
+        let support = 1.0 / (SUPPORT_RADII * at.radius_mm).powi(2);
+        let (per_radius, per_outlier) = (1.0 / at.radius_mm, 1.0 / outlier_mm);
         let mut sums = Sums::default();
         for p in points {
             let from = p - at.centre;
-            let along = from.dot(&at.axis);
-            let across = from - at.axis * along;
-            let distance = across.norm();
-            let residual = distance - at.radius_mm;
-            let near = 1.0 - from.norm_squared() / support;
-            let good = 1.0 - (residual / outlier_mm).powi(2);
-            if near <= 0.0 || good <= 0.0 || distance <= 0.0 {
+            let near = 1.0 - from.norm_squared() * support;
+            let (x, y) = (from.dot(u), from.dot(v));
+            let square = x * x + y * y;
+            if near <= 0.0 || square <= 0.0 {
                 continue;
             }
-
-            let weight = near * near * good * good;
-            let (mu, mv) = (across.dot(&u) / distance, across.dot(&v) / distance);
-            let lever = along / at.radius_mm;
-            let row = Vector5::new(-mu, -mv, -lever * mu, -lever * mv, -1.0);
-            sums.normal.syger(weight, &row, &row, 1.0);
-            sums.right -= row * (weight * residual);
-            sums.weight += weight;
-            sums.square += weight * residual * residual;
-            sums.normals += across * (weight / distance);
+            sums.seen += 1;
+            let distance = square.sqrt();
+            let residual = distance - at.radius_mm;
+            let off = residual * per_outlier;
+            let good = 1.0 - off * off;
+            if good <= 0.0 {
+                continue;
+            }
+            let w = near * near * good * good;
+            let l = from.dot(&at.axis) * per_radius;
+            let (mu, mv) = (x / distance, y / distance);
+            let (wu, wv) = (w * mu, w * mv);
+            let mut products = [wu * mu, wu * mv, wv * mv];
+            for sum in &mut sums.products {
+                for k in 0..3 {
+                    sum[k] += products[k];
+                    products[k] *= l;
+                }
+            }
+            let first = [wu, wv, l * wu, l * wv];
+            for (k, value) in first.iter().enumerate() {
+                sums.first[k] += value;
+                sums.right[k] += value * residual;
+            }
+            sums.residual += w * residual;
+            sums.square += w * residual * residual;
+            sums.weight += w;
             sums.count += 1;
         }
-        sums.normal.fill_upper_triangle_with_lower_triangle();
         sums
     }
 
     /// Shift u, shift v, tilt u, tilt v (at one radius), radius.
     fn solve(&self, free_radius: bool) -> Option<Vector5<f64>> {
-        let mut normal = self.normal;
-        let mut right = self.right;
+        let ([a, b, c], f, r) = (self.products, self.first, self.right);
+        let mut normal = Matrix5::new(
+            a[0],
+            a[1],
+            b[0],
+            b[1],
+            f[0], //
+            a[1],
+            a[2],
+            b[1],
+            b[2],
+            f[1], //
+            b[0],
+            b[1],
+            c[0],
+            c[1],
+            f[2], //
+            b[1],
+            b[2],
+            c[1],
+            c[2],
+            f[3], //
+            f[0],
+            f[1],
+            f[2],
+            f[3],
+            self.weight,
+        );
+        let mut right = Vector5::new(r[0], r[1], r[2], r[3], self.residual);
         if !free_radius {
             normal.fixed_view_mut::<1, 4>(4, 0).fill(0.0);
             normal.fixed_view_mut::<4, 1>(0, 4).fill(0.0);
-            normal[(4, 4)] = self.weight;
             right[4] = 0.0;
         }
         // A touch of damping: a narrow strip of surface leaves one shift nearly free.

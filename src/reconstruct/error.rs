@@ -7,11 +7,17 @@ use thiserror::Error;
 pub enum ReconstructError {
     /// Nothing in the cloud is curved like a tube.
     #[error(
-        "no tube in the scan: no curvature radius that most of the {points} points agree on; is this a scan of a tube, in the right unit?"
+        "no tube in the scan: no curvature radius that enough of the {points} points agree on ({faces} planar faces \
+        set aside; the points lie {spacing_mm:.2} mm apart, where a tube needs one per third of its radius or more \
+        densely); is this a scan of a tube, in the right unit?"
     )]
     NoTube {
         /// Points in the cloud.
         points: usize,
+        /// Planar faces that were found.
+        faces: usize,
+        /// Usual distance of the points looked at.
+        spacing_mm: f64,
     },
     /// The points on the surface are too few or too scattered.
     #[error(
@@ -27,8 +33,11 @@ pub enum ReconstructError {
         /// Spacing that would do.
         wanted_mm: f64,
     },
-    /// More than one tube.
-    #[error("the scan shows {} separate tubes (centre lines of {}); scan one part at a time", .lengths_mm.len(), list(.lengths_mm))]
+    /// More tubes than could be told apart by their size.
+    #[error(
+        "the scan shows {} separate tubes (centre lines of {}); scan one part at a time, or name the nominal",
+        .lengths_mm.len(), list(.lengths_mm)
+    )]
     SeveralTubes {
         /// Lengths of their centre lines.
         lengths_mm: Vec<f64>,

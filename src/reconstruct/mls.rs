@@ -5,28 +5,40 @@ use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
-use super::radius::{JET_RADII, median};
+use super::radius::{JET_RADII, Near, median};
 use crate::cloud::{Neighbours, PointCloud};
 use crate::recognize::{Jet, fit_jet};
 
-/// Cell of the cloud in which neighbourhoods are looked up, in tube radii.
-const WORK_CELL_RADII: f64 = 0.12;
+/// Distance of the spine's points, in tube radii.
+pub const SPINE_SPACING_RADII: f64 = 0.3;
 
-/// Cell of the points that are projected, in tube radii.
-const SEED_CELL_RADII: f64 = 0.28;
+/// Cell of the cloud in which neighbourhoods are looked up, in tube radii.
+pub const WORK_CELL_RADII: f64 = 0.15;
+
+/// Cell of the points whose jets guess the spine, in tube radii.
+const SEED_CELL_RADII: f64 = 0.5;
+
+/// Distance of the places at which cylinders are fitted, in tube radii.
+const GUESS_SPACING_RADII: f64 = 0.2;
+
+/// Curvatures that differ more are something else's and say nothing of the noise.
+const MOST_ERROR: f64 = 0.5;
+
+/// Spine points this near to each other must be on one spine: no farther aside of the other's tangent than errors and
+/// a bend of two radii explain (its sagitta is along^2 / 4).
+const APART_RADII: f64 = 1.4;
+const ASIDE_RADII: f64 = 0.15;
+const TIGHTEST_RADII: f64 = 0.25;
+
+/// Share of the points around a cylinder that must lie on it.
+const LEAST_SHARE: f64 = 0.5;
 
 /// Curvature may differ from the tube's by this share (paper 000, section 7), or by what noise explains.
 const CURVATURE_SHARE: f64 = 0.1;
 
-/// Distance of a point from its spine point may differ from the radius by this share (same section).
-const RADIUS_SHARE: f64 = 0.1;
-
 /// A strip of surface narrower than about 50 degrees (see [`Cylinder::opening`]) tells no axis. On the inside of a
 /// tight bend both curvatures are about equal and the normal may point either way; this rule finds the wrong ones.
 const LEAST_OPENING: f64 = 0.06;
-
-/// Spine points with less than this share of the usual number of neighbours are strays.
-const LEAST_DENSITY: f64 = 0.2;
 
 /// One point near the spine with the direction of the tube there.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,86 +49,113 @@ pub struct SpinePoint {
     pub tangent: Vector3<f64>,
 }
 
-/// Projects a thinned set of the cloud's points onto the spine.
-pub fn spine_cloud(cloud: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
-    let work = cloud.thinned(WORK_CELL_RADII * radius_mm);
-    let neighbours = Neighbours::new(&work);
+/// Projects a thinned set of the cloud's points onto the spine: what the jets guess is gathered first, so that one
+/// cylinder per place is fitted, from a good start.
+pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
+    let index = Neighbours::new(work);
     let seeds = work.thinned(SEED_CELL_RADII * radius_mm);
+    let reach = JET_RADII * radius_mm;
     let jets: Vec<Option<Jet>> = (0..seeds.len())
         .into_par_iter()
-        .map(|i| {
-            let near = near(&work, &neighbours, &seeds.point(i), JET_RADII * radius_mm);
-            fit_jet(&seeds.point(i), &near, JET_RADII * radius_mm)
+        .map_init(Near::default, |near, i| {
+            let p = seeds.point(i);
+            fit_jet(&p, near.within(work, &index, &p, reach), reach)
         })
         .collect();
-    let mut errors: Vec<f64> =
-        jets.iter().flatten().map(|j| (j.strong_per_mm * radius_mm - 1.0).abs()).collect();
+    let error = |j: &Jet| (j.strong_per_mm * radius_mm - 1.0).abs();
+    let mut errors: Vec<f64> = jets.iter().flatten().map(error).filter(|e| *e < MOST_ERROR).collect();
     let usual = median(&mut errors).unwrap_or(0.0);
     let allowed = CURVATURE_SHARE.max(4.0 * usual);
-    (0..seeds.len())
-        .into_par_iter()
-        .filter_map(|i| {
-            let jet = jets[i].as_ref()?;
-            if (jet.strong_per_mm * radius_mm - 1.0).abs() > allowed {
-                return None;
+    let guesses: Vec<SpinePoint> = jets
+        .iter()
+        .flatten()
+        .filter(|j| error(j) <= allowed)
+        .map(|j| SpinePoint { point: j.foot - j.normal * radius_mm, tangent: j.weak_direction })
+        .collect();
+    let places = condense(&guesses, GUESS_SPACING_RADII * radius_mm);
+    let found: Vec<Option<Projected>> = places
+        .par_iter()
+        .map_init(Near::default, |near, place| project(place, radius_mm, near, work, &index))
+        .collect();
+    strongest(found.into_iter().flatten().collect(), radius_mm)
+}
+
+/// A spine point and how many points bear it out.
+type Projected = (SpinePoint, f64);
+
+/// Two tubes cannot be nearer than two radii: of spine points that lie side by side only the better borne out stay.
+fn strongest(found: Vec<Projected>, radius_mm: f64) -> Vec<SpinePoint> {
+    let mut order: Vec<usize> = (0..found.len()).collect();
+    order.sort_by(|&a, &b| found[b].1.total_cmp(&found[a].1).then(a.cmp(&b)));
+    let points: Vec<Point3<f64>> = found.iter().map(|f| f.0.point).collect();
+    let index = Neighbours::new(&PointCloud::from_points(&points));
+    let mut state = vec![Stand::Open; found.len()];
+    let mut near = Vec::new();
+    for i in order {
+        if state[i] == Stand::Dropped {
+            continue;
+        }
+        state[i] = Stand::Stays;
+        let spine = &found[i].0;
+        index.within(&spine.point, APART_RADII * radius_mm, &mut near);
+        for k in near.iter().map(|&k| k as usize) {
+            let gap = (points[k] - spine.point) / radius_mm;
+            let along = gap.dot(&spine.tangent);
+            let aside = (gap.norm_squared() - along * along).max(0.0).sqrt();
+            if state[k] == Stand::Open && aside > ASIDE_RADII + TIGHTEST_RADII * along * along {
+                state[k] = Stand::Dropped;
             }
-            project(&seeds.point(i), jet, radius_mm, |p, reach| near(&work, &neighbours, p, reach))
-        })
-        .collect()
+        }
+    }
+    found.iter().zip(state).filter(|(_, s)| *s == Stand::Stays).map(|(f, _)| f.0).collect()
 }
 
-fn near(work: &PointCloud, neighbours: &Neighbours, p: &Point3<f64>, reach_mm: f64) -> Vec<Point3<f64>> {
-    let mut found = Vec::new();
-    neighbours.within(p, reach_mm, &mut found);
-    found.iter().map(|&i| work.point(i as usize)).collect()
+/// What is known of a spine point beside others.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Stand {
+    Open,
+    Stays,
+    Dropped,
 }
 
-/// One projection: starting values from the jet (paper 000, sections 3.3 and 3.4), cylinder, outlier rule.
+/// One projection: a cylinder from the guessed axis, and the outlier rules.
 fn project(
-    p: &Point3<f64>,
-    jet: &Jet,
+    place: &SpinePoint,
     radius_mm: f64,
-    near: impl Fn(&Point3<f64>, f64) -> Vec<Point3<f64>>,
-) -> Option<SpinePoint> {
-    let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
-    let points = near(&start.centre, REACH_RADII * radius_mm);
-    let cylinder = fit_cylinder(&points, &start, false)?;
-    let distance = (p - cylinder.centre).norm();
-    let fits = (distance - radius_mm).abs() < RADIUS_SHARE * radius_mm && cylinder.opening > LEAST_OPENING;
-    fits.then_some(SpinePoint { point: cylinder.centre, tangent: cylinder.axis })
+    near: &mut Near,
+    work: &PointCloud,
+    index: &Neighbours,
+) -> Option<Projected> {
+    let start = Cylinder::guess(place.point, place.tangent, radius_mm);
+    let points = near.within(work, index, &start.centre, REACH_RADII * radius_mm);
+    let cylinder = fit_cylinder(points, &start, false)?;
+    let fits = cylinder.opening > LEAST_OPENING && cylinder.share > LEAST_SHARE;
+    let spine = SpinePoint { point: cylinder.centre, tangent: cylinder.axis };
+    fits.then_some((spine, cylinder.count as f64 * cylinder.share))
 }
 
 /// Thins the spine cloud to points about `spacing_mm` apart, each moved sideways onto the mean of its
-/// neighbourhood; strays vanish.
+/// neighbourhood.
 pub fn condense(spine: &[SpinePoint], spacing_mm: f64) -> Vec<SpinePoint> {
     if spine.is_empty() {
         return Vec::new();
     }
     let points: Vec<Point3<f64>> = spine.iter().map(|s| s.point).collect();
     let neighbours = Neighbours::new(&PointCloud::from_points(&points));
-    let near = |i: usize| {
-        let mut found = Vec::new();
-        neighbours.within(&points[i], spacing_mm, &mut found);
-        found
-    };
-    let mut counts: Vec<f64> = (0..spine.len()).step_by(7).map(|i| near(i).len() as f64).collect();
-    let least = median(&mut counts).map_or(3.0, |usual| (LEAST_DENSITY * usual).max(3.0)) as usize;
     let mut taken = vec![false; spine.len()];
     let mut out = Vec::new();
+    let mut found = Vec::new();
     for i in 0..spine.len() {
         if taken[i] {
             continue;
         }
-        let found = near(i);
+        neighbours.within(&points[i], spacing_mm, &mut found);
         found.iter().for_each(|&k| taken[k as usize] = true);
         let along: Vec<&SpinePoint> = found
             .iter()
             .map(|&k| &spine[k as usize])
             .filter(|s| s.tangent.dot(&spine[i].tangent).abs() > 0.8)
             .collect();
-        if along.len() < least {
-            continue;
-        }
         let n = along.len() as f64;
         let mean: Vector3<f64> = along.iter().map(|s| s.point.coords).sum::<Vector3<f64>>() / n;
         let turn = |s: &SpinePoint| s.tangent * s.tangent.dot(&spine[i].tangent).signum();

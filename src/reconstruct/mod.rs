@@ -1,8 +1,9 @@
 //! Cloud to measured tube: spine, arc-line spline, least-squares fit, uncertainty.
 //!
-//! Between `cloud` and `inspect`. The way of paper 000, stage by stage: tube radius from jets ([`radius`]), points
-//! onto the spine ([`mls`]), polygon ([`crust`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`],
-//! [`apollonius`]), least squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
+//! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
+//! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, polygon by
+//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), least
+//! squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
 
 pub mod apollonius;
 pub mod arcline;
@@ -19,11 +20,14 @@ mod local;
 mod measure;
 pub mod mls;
 pub mod model;
+pub mod moderate;
 pub mod moments;
 mod moves;
 mod normal;
 mod outline;
+pub mod owner;
 pub mod radius;
+pub mod scene;
 mod sections;
 pub mod simplify;
 pub mod structure;
@@ -57,17 +61,8 @@ pub struct Reconstruction {
     pub residuals_mm: Vec<f64>,
 }
 
-/// Spacing of the spine's polygon in tube radii.
-const SPINE_SPACING_RADII: f64 = 0.3;
-
 /// Cell of the sample that decides the structure, in tube radii.
 const SAMPLE_CELL_RADII: f64 = 0.2;
-
-/// Share of the places of the cloud that must find a spine.
-const LEAST_SPINE_SHARE: f64 = 0.1;
-
-/// A second chain of this share of the longest is another tube, not debris.
-const SECOND_TUBE_SHARE: f64 = 0.15;
 
 /// An angle is never left open: a tube with one less certain than this was not measured.
 const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
@@ -77,10 +72,14 @@ const LEAST_USED_SHARE: f64 = 0.5;
 
 /// Reconstructs the tube that the cloud shows.
 pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstruction, ReconstructError> {
-    let points = cloud.len();
-    let radius_mm = radius::estimate(cloud).ok_or(ReconstructError::NoTube { points })?;
-    let polygon = centre_line(cloud, radius_mm)?;
-    let sample: Vec<Point3<f64>> = cloud.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
+    let scene = scene::look(cloud, options.nominal)?;
+    let (radius_mm, polygon) = (scene.radius_mm, scene.polygon);
+    let own: Vec<Point3<f64>> = match &scene.own {
+        Some(own) => own.iter().map(|&i| cloud.point(i as usize)).collect(),
+        None => cloud.iter().collect(),
+    };
+    let points = own.len();
+    let sample: Vec<Point3<f64>> = scene.thin.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
     let not_bent = || ReconstructError::NotBent {
         length_mm: crust::length_mm(&polygon),
         radius_mm,
@@ -91,7 +90,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     if moves::is_free_form(&model.lra, radius_mm) {
         return Err(not_bent());
     }
-    let mut all = Sample::new(cloud.iter().collect(), &model);
+    let mut all = Sample::new(own, &model);
     let mut best = fit(
         &mut all,
         &model,
@@ -108,42 +107,20 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
     }
-    let residuals_mm = all.residuals(&best.model);
-    let mut used: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
+    let own_residuals_mm = all.residuals(&best.model);
+    let mut used: Vec<f64> =
+        own_residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
+    measured.points_total = cloud.len();
+    measured.warnings.splice(0..0, scene.warnings);
+    // The points of the surroundings have a distance from the tube too.
+    let residuals_mm = match scene.own {
+        Some(_) => Sample::new(cloud.iter().collect(), &best.model).residuals(&best.model),
+        None => own_residuals_mm,
+    };
     let found = Reconstruction { measured, spine: best.model.spine(), lra: best.model.lra, residuals_mm };
     Ok(match options.nominal {
         Some(nominal) => direction::as_nominal(found, nominal),
         None => found,
     })
-}
-
-/// The spine's polygon through the whole tube.
-fn centre_line(cloud: &PointCloud, radius_mm: f64) -> Result<Vec<Point3<f64>>, ReconstructError> {
-    let spacing = SPINE_SPACING_RADII * radius_mm;
-    let spine = mls::spine_cloud(cloud, radius_mm);
-    let condensed = mls::condense(&spine, spacing);
-    let mut found = crust::connect(&condensed, spacing, radius_mm);
-    let lengths: Vec<f64> = found.chains.iter().map(|c| crust::solid_length_mm(c, spacing)).collect();
-    let longest = lengths.first().copied().unwrap_or(0.0);
-    if (spine.len() as f64) < LEAST_SPINE_SHARE * cloud.thinned(spacing).len() as f64 {
-        return Err(ReconstructError::NoTube { points: cloud.len() });
-    }
-    if longest < 2.0 * radius_mm {
-        let wanted_mm = 0.2 * radius_mm;
-        return Err(ReconstructError::TooSparse {
-            found: spine.len(),
-            points: cloud.len(),
-            radius_mm,
-            wanted_mm,
-        });
-    }
-    let tubes: Vec<f64> = lengths.into_iter().filter(|l| *l >= SECOND_TUBE_SHARE * longest).collect();
-    if tubes.len() > 1 {
-        return Err(ReconstructError::SeveralTubes { lengths_mm: tubes });
-    }
-    if found.closed {
-        return Err(ReconstructError::Ring { length_mm: longest });
-    }
-    Ok(found.chains.swap_remove(0))
 }

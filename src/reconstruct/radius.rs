@@ -1,5 +1,8 @@
-//! The tube's radius before anything else is known: median curvature radius of jets (paper 000, section 3.1),
-//! with the neighbourhood found by itself, then median of local cylinder fits.
+//! The tube's radius before anything else is known: curvature radii of jets (paper 000, section 3.1) with the
+//! neighbourhood found by itself, then local cylinder fits.
+//!
+//! A tube may be a small part of what the scan shows, so it is not a median that counts but how many places agree: at
+//! a scale that suits a tube, jets all over it give its radius, while edges and noise give any.
 
 use nalgebra::Point3;
 use rayon::prelude::*;
@@ -11,110 +14,217 @@ use crate::recognize::{Jet, fit_jet};
 /// Neighbourhood of a jet in tube radii (paper 000, section 7).
 pub const JET_RADII: f64 = 2.0 / 3.0;
 
-/// Places that are looked at.
-const PLACES: usize = 400;
-
-/// Points that are enough to find the radius by.
-const ENOUGH_POINTS: usize = 60_000;
+/// Scales, in radii of the tube that they find, that suit it: more than one [`SCALE_STEP`] wide.
+const SUITS: std::ops::Range<f64> = 0.42..1.05;
 
 /// Ratio of neighbouring scales.
-const SCALE_STEP: f64 = 0.75;
+const SCALE_STEP: f64 = 1.8;
+
+/// Places that are looked at to find a candidate and to weigh it.
+const PLACES: usize = 72;
+const JUDGES: usize = 90;
+
+/// Radii within this share of each other are one tube's.
+const AGREE: f64 = 0.12;
+
+/// Share of the places that must agree on a radius to make it a candidate, and then a tube.
+const LEAST_AGREEING: f64 = 0.12;
+const LEAST_SUPPORT: f64 = 0.06;
+
+/// Cylinders that must support a radius.
+const LEAST_CYLINDERS: usize = 6;
+
+/// A cylinder counts when this share of the points around it lie on it.
+const LEAST_SHARE: f64 = 0.5;
+
+/// Straight enough to tell the radius: weak curvature over strong.
+const STRAIGHT: f64 = 0.08;
+
+/// A radius with this support is what the scan shows.
+const CLEAR_SUPPORT: f64 = 0.7;
+
+/// A tube's radius is less than this share of the scene.
+const WIDEST_SHARE: f64 = 0.25;
+
+/// A candidate's cylinders may be this much less exact than the most exact ones.
+const MOST_OVER_NOISE: f64 = 6.0;
+
+/// Thinning from level to level.
+const LEVEL_STEP: f64 = 1.7;
+
+/// Points of a neighbourhood across, at a scale's thinning.
+const ACROSS: f64 = 5.0;
+
+/// A radius that tubes in the cloud may have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Candidate {
+    /// Outer radius.
+    pub radius_mm: f64,
+    /// Share of the places that lie on cylinders of this radius.
+    pub support: f64,
+    /// Distance of the points from these cylinders, root mean square, at the better places.
+    pub rms_mm: f64,
+}
 
 /// What one scale says of the radius.
 #[derive(Debug, Clone, Copy)]
 struct Reading {
     radius_mm: f64,
-    /// Median absolute deviation of the curvature over its median.
-    spread: f64,
+    agreeing: f64,
 }
 
-/// The radius as far as jets and local cylinders tell; None when nothing in the cloud is curved like a tube.
-pub fn estimate(cloud: &PointCloud) -> Option<f64> {
-    let (low, high) = cloud.bounds()?;
-    let diagonal = (high - low).norm();
-    let mut coarse = thin_to(cloud, ENOUGH_POINTS, diagonal);
-    let mut best: Option<Reading> = None;
-    let mut readings = Vec::new();
-    // From fine to coarse, each scale on the thinned cloud of the one before.
-    let mut scale = diagonal / 1500.0;
-    while scale < diagonal / 3.0 {
-        coarse = coarse.thinned(scale / 6.0);
-        if let Some(reading) = read_at(&coarse, scale) {
-            readings.push((scale, reading));
-        }
-        scale /= SCALE_STEP;
+/// Radii of tubes in a cloud whose points lie about `spacing_mm` apart, the best supported first; empty when nothing
+/// in the cloud is curved like a tube.
+pub fn candidates(cloud: &PointCloud, spacing_mm: f64) -> Vec<Candidate> {
+    let coarse = spacing_mm * LEVEL_STEP;
+    let mut out = judged(cloud, &readings(&cloud.thinned(coarse), coarse));
+    // A tube so thin that its points must all be looked at.
+    if out.iter().all(|c| c.support < CLEAR_SUPPORT) {
+        out.extend(judged(cloud, &readings(cloud, spacing_mm)));
     }
-    for (scale, reading) in readings {
-        // The neighbourhood must suit the radius that it finds; of those that do the sharpest counts.
-        let suits = (0.45..1.0).contains(&(scale / reading.radius_mm));
-        if suits && best.is_none_or(|b| reading.spread < b.spread) {
-            best = Some(reading);
-        }
-    }
-    let jets = best.filter(|b| b.spread < 0.35)?.radius_mm;
-    Some(refine(cloud, jets).unwrap_or(jets))
+    // One scanner, one noise: what is much farther off its cylinders is no cylinder.
+    let noise = out.iter().map(|c| c.rms_mm).fold(f64::INFINITY, f64::min);
+    out.retain(|c| c.rms_mm <= MOST_OVER_NOISE * noise);
+    out.sort_by(|a, b| b.support.total_cmp(&a.support).then(a.radius_mm.total_cmp(&b.radius_mm)));
+    out.dedup_by(|b, a| (a.radius_mm / b.radius_mm).ln().abs() < 2.0 * AGREE);
+    out
 }
 
-fn thin_to(cloud: &PointCloud, enough: usize, diagonal: f64) -> PointCloud {
-    let mut cell = diagonal / 2000.0;
-    let mut out = cloud.clone();
-    while out.len() > enough {
-        out = out.thinned(cell);
-        cell *= 1.5;
+/// The readings that cylinders bear out.
+fn judged(cloud: &PointCloud, readings: &[Reading]) -> Vec<Candidate> {
+    let mut out: Vec<Candidate> = Vec::new();
+    for reading in readings {
+        let known = out.iter().any(|c| (c.radius_mm / reading.radius_mm).ln().abs() < 2.0 * AGREE);
+        if known {
+            continue;
+        }
+        out.extend(judge(cloud, reading.radius_mm));
+        if out.last().is_some_and(|c| c.support > CLEAR_SUPPORT) {
+            break;
+        }
     }
     out
 }
 
-fn places(cloud: &PointCloud) -> Vec<Point3<f64>> {
-    let stride = cloud.len().div_ceil(PLACES).max(1);
+/// One reading per scale, the most agreed on first.
+fn readings(cloud: &PointCloud, spacing_mm: f64) -> Vec<Reading> {
+    let Some((low, high)) = cloud.bounds() else { return Vec::new() };
+    let widest = (high - low).norm() * WIDEST_SHARE;
+    let mut readings = Vec::new();
+    let mut scale = 2.0 * spacing_mm;
+    let mut thinned: Option<PointCloud> = None;
+    let mut index = Neighbours::new(cloud);
+    let mut cell = spacing_mm;
+    while scale < SUITS.end * widest {
+        if scale / ACROSS > LEVEL_STEP * cell {
+            cell = scale / ACROSS;
+            let next = thinned.as_ref().unwrap_or(cloud).thinned(cell);
+            index = Neighbours::new(&next);
+            thinned = Some(next);
+        }
+        let level = thinned.as_ref().unwrap_or(cloud);
+        readings.extend(read_at(level, &index, scale).filter(|r| r.radius_mm < widest));
+        scale *= SCALE_STEP;
+    }
+    readings.sort_by(|a: &Reading, b| b.agreeing.total_cmp(&a.agreeing));
+    readings
+}
+
+fn places(cloud: &PointCloud, most: usize) -> Vec<Point3<f64>> {
+    let stride = cloud.len().div_ceil(most).max(1);
     (0..cloud.len()).step_by(stride).map(|i| cloud.point(i)).collect()
 }
 
-/// Jets at a number of places of the cloud.
-fn jets_at(cloud: &PointCloud, neighbours: &Neighbours, scale: f64) -> Vec<Jet> {
-    places(cloud)
+/// Jets at a number of places of the cloud; None where there is none.
+fn jets_at(cloud: &PointCloud, index: &Neighbours, scale: f64, places: &[Point3<f64>]) -> Vec<Option<Jet>> {
+    places
         .par_iter()
-        .filter_map(|p| {
-            let mut found = Vec::new();
-            neighbours.within(p, scale, &mut found);
-            let near: Vec<Point3<f64>> = found.iter().map(|&i| cloud.point(i as usize)).collect();
-            fit_jet(p, &near, scale)
-        })
+        .map_init(Near::default, |near, p| fit_jet(p, near.within(cloud, index, p, scale), scale))
         .collect()
 }
 
-fn read_at(cloud: &PointCloud, scale: f64) -> Option<Reading> {
-    let jets = jets_at(cloud, &Neighbours::new(cloud), scale);
-    if jets.len() < places(cloud).len().min(PLACES) / 4 || jets.len() < 20 {
-        return None;
-    }
-    let mut curvatures: Vec<f64> = jets.iter().map(|j| j.strong_per_mm).collect();
-    let middle = median(&mut curvatures)?;
-    let mut deviations: Vec<f64> = curvatures.iter().map(|c| (c - middle).abs()).collect();
-    let spread = median(&mut deviations)? / middle;
-    Some(Reading { radius_mm: 1.0 / middle, spread })
+/// Room for the points of one neighbourhood, used again and again.
+#[derive(Default)]
+pub(super) struct Near {
+    indices: Vec<u32>,
+    points: Vec<Point3<f64>>,
 }
 
-/// Median of cylinders of free radius, preferring places where the tube is straight.
-fn refine(cloud: &PointCloud, radius_mm: f64) -> Option<f64> {
-    let work = cloud.thinned(0.1 * radius_mm);
-    let neighbours = Neighbours::new(&work);
-    let jets = jets_at(&work, &neighbours, JET_RADII * radius_mm);
-    let fitted: Vec<(f64, bool)> = jets
-        .par_iter()
-        .filter_map(|jet| {
-            let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
-            let mut found = Vec::new();
-            neighbours.within(&start.centre, REACH_RADII * radius_mm, &mut found);
-            let near: Vec<Point3<f64>> = found.iter().map(|&i| work.point(i as usize)).collect();
-            let cylinder = fit_cylinder(&near, &start, true)?;
-            let straight = (jet.weak_per_mm * radius_mm).abs() < 0.08;
-            Some((cylinder.radius_mm, straight))
-        })
+impl Near {
+    /// The points within a radius.
+    pub fn within(
+        &mut self,
+        cloud: &PointCloud,
+        index: &Neighbours,
+        p: &Point3<f64>,
+        radius_mm: f64,
+    ) -> &[Point3<f64>] {
+        index.within(p, radius_mm, &mut self.indices);
+        self.points.clear();
+        self.points.extend(self.indices.iter().map(|&i| cloud.point(i as usize)));
+        &self.points
+    }
+}
+
+/// The radius on which most places agree at one scale, of those that the scale suits.
+fn read_at(cloud: &PointCloud, index: &Neighbours, scale: f64) -> Option<Reading> {
+    let places = places(cloud, PLACES);
+    let jets = jets_at(cloud, index, scale, &places);
+    let mut logs: Vec<f64> = jets
+        .iter()
+        .flatten()
+        .filter(|j| SUITS.contains(&(scale * j.strong_per_mm)))
+        .map(|j| -j.strong_per_mm.ln())
         .collect();
-    let mut straight: Vec<f64> = fitted.iter().filter(|(_, s)| *s).map(|(r, _)| *r).collect();
-    let mut all: Vec<f64> = fitted.iter().map(|(r, _)| *r).collect();
-    if straight.len() >= 30 { median(&mut straight) } else { median(&mut all) }
+    logs.sort_by(f64::total_cmp);
+    let (from, count) = densest(&logs, 2.0 * AGREE)?;
+    let radius_mm = logs[from + count / 2].exp();
+    let agreeing = count as f64 / places.len() as f64;
+    (agreeing >= LEAST_AGREEING && count >= LEAST_CYLINDERS).then_some(Reading { radius_mm, agreeing })
+}
+
+/// Start and number of the values in the fullest window of a sorted list.
+fn densest(sorted: &[f64], width: f64) -> Option<(usize, usize)> {
+    let count = |i: usize| sorted[i..].iter().take_while(|v| **v <= sorted[i] + width).count();
+    (0..sorted.len()).map(|i| (i, count(i))).max_by_key(|&(i, n)| (n, std::cmp::Reverse(i)))
+}
+
+/// How many places lie on cylinders of about this radius, and their median radius, of straight places if there are
+/// enough.
+fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
+    let work = cloud.thinned(0.13 * radius_mm);
+    let index = Neighbours::new(&work);
+    let places = places(&work, JUDGES);
+    let fitted: Vec<(f64, bool, f64)> = places
+        .par_iter()
+        .map_init(Near::default, |near, p| {
+            let reach = JET_RADII * radius_mm;
+            let jet = fit_jet(p, near.within(&work, &index, p, reach), reach)?;
+            let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
+            let points = near.within(&work, &index, &start.centre, REACH_RADII * radius_mm);
+            let cylinder = fit_cylinder(points, &start, true)?;
+            let straight = (jet.weak_per_mm * radius_mm).abs() < STRAIGHT;
+            (cylinder.share > LEAST_SHARE).then_some((cylinder.radius_mm, straight, cylinder.rms_mm))
+        })
+        .collect::<Vec<_>>()
+        .into_iter()
+        .flatten()
+        .collect();
+    let mut logs: Vec<f64> = fitted.iter().map(|f| f.0.ln()).collect();
+    logs.sort_by(f64::total_cmp);
+    let (from, count) = densest(&logs, 2.0 * AGREE)?;
+    let support = count as f64 / places.len() as f64;
+    if count < LEAST_CYLINDERS || support < LEAST_SUPPORT {
+        return None;
+    }
+    let window = logs[from].exp()..=logs[from + count - 1].exp();
+    let within = |f: &&(f64, bool, f64)| window.contains(&f.0);
+    let mut straight: Vec<f64> = fitted.iter().filter(within).filter(|f| f.1).map(|f| f.0).collect();
+    let mut all: Vec<f64> = fitted.iter().filter(within).map(|f| f.0).collect();
+    let radius_mm = if straight.len() >= 20 { median(&mut straight) } else { median(&mut all) };
+    let mut rms: Vec<f64> = fitted.iter().filter(within).map(|f| f.2).collect();
+    rms.sort_by(f64::total_cmp);
+    Some(Candidate { radius_mm: radius_mm?, support, rms_mm: rms[rms.len() / 4] })
 }
 
 /// Median; None without values.
