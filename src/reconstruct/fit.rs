@@ -164,6 +164,14 @@ pub struct Way {
 const PATIENCE: usize = 2;
 const HOPE: f64 = 4.0;
 
+/// Damping of the first step, of one that is as good as undamped, and from which on no step will help.
+const FIRST_DAMPING: f64 = 1e-6;
+const NO_DAMPING: f64 = 1e-12;
+const MOST_DAMPING: f64 = 1e6;
+
+/// Share of a value's standard deviation that is not worth another step.
+const RESOLVED: f64 = 0.03;
+
 /// Levenberg-Marquardt from a starting model.
 pub fn descend(
     data: &mut impl Data,
@@ -179,19 +187,22 @@ pub fn descend(
     let mut model = start;
     let mut pass = data.pass(&model, way.cutoff_mm);
     let mut cost = total(&model, &pass);
-    let (mut passes, mut damping) = (1, 1e-4);
+    let (mut passes, mut damping) = (1, FIRST_DAMPING);
     for taken in 0..way.steps {
         let (normal, gradient) = full_equations(&model, &pass, parameters, &prior, way.noise_mm);
+        // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
+        // since in a narrow valley damped steps are short.
+        let left =
+            damped_step(&normal, &gradient, NO_DAMPING).map_or(f64::INFINITY, |step| -gradient.dot(&step));
+        if left < (RESOLVED * way.noise_mm).powi(2) {
+            return Descent { model, pass, passes, stop: Stop::Converged };
+        }
         let mut gained = None;
-        while damping < 1e8 {
+        while damping < MOST_DAMPING {
             let Some(step) = damped_step(&normal, &gradient, damping) else {
                 damping *= 10.0;
                 continue;
             };
-            // Predicted gain far below the noise of the cost itself: nothing left to win.
-            if 0.5 * -gradient.dot(&step) < 1e-9 * cost.max(1e-12) {
-                return Descent { model, pass, passes, stop: Stop::Converged };
-            }
             let next = model.stepped(parameters, &step);
             let next_pass = data.pass(&next, way.cutoff_mm);
             let next_cost = total(&next, &next_pass);
@@ -199,15 +210,12 @@ pub fn descend(
             if next_cost < cost {
                 gained = Some(cost - next_cost);
                 (model, pass, cost) = (next, next_pass, next_cost);
-                damping = (damping * 0.1).max(1e-9);
+                damping = (damping * 0.1).max(NO_DAMPING);
                 break;
             }
             damping *= 10.0;
         }
         let Some(gain) = gained else { return Descent { model, pass, passes, stop: Stop::Stalled } };
-        if gain < 1e-7 * cost {
-            return Descent { model, pass, passes, stop: Stop::Converged };
-        }
         if taken >= PATIENCE && cost - HOPE * gain > way.goal {
             return Descent { model, pass, passes, stop: Stop::Hopeless };
         }
