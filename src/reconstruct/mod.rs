@@ -26,6 +26,7 @@ mod moves;
 mod normal;
 mod outline;
 pub mod owner;
+mod profile;
 pub mod radius;
 pub mod scene;
 mod sections;
@@ -101,6 +102,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
     // Sigmas by what the points say together, not by their number (see `CentreLine::correlation`).
+    best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
     best.covariance *= CentreLine::measure(&all.points, &best.model).correlation(&best.model);
     let mut measured = measure::measure(&mut best, &mut all);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {

@@ -14,6 +14,7 @@ use super::moves::{
     doubled, is_free_form, likeliest_pairs, mean_radius_mm, merged, split, with_bend, with_common_radius,
     without_bend,
 };
+use super::profile::{Held, lengths};
 use super::sections::CentreLine;
 use super::simplify::simplify;
 
@@ -67,6 +68,8 @@ pub struct Structure {
     pub noise_mm: f64,
     /// Expectation of the bend radii that it was fitted with.
     pub prior: Option<RadiusPrior>,
+    /// What the linear covariance overstates.
+    pub held: Vec<Held>,
 }
 
 /// The data and what all candidates share.
@@ -194,6 +197,12 @@ impl Jury {
         all.filter(|m| m.lra.bends.len() <= MOST_BENDS).collect()
     }
 
+    /// What is handed on.
+    fn structure(&self, model: TubeModel) -> Structure {
+        let held = lengths(&self.line, &model, self.correlation, self.prior);
+        Structure { noise_mm: self.line.noise_mm, prior: self.prior, held, model }
+    }
+
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
     /// points may have taken some that are not the tube's for its own.
     fn confirmed(&self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
@@ -222,7 +231,7 @@ impl Jury {
             let fits = less.iter().map(&mut fit_points);
             match fits.min_by(|a, b| a.1.total_cmp(&b.1)) {
                 Some(better) if better.1 < score => (best, score) = better,
-                _ => return Structure { model: best.model, noise_mm, prior: self.prior },
+                _ => return self.structure(best.model),
             }
         }
     }

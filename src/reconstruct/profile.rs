@@ -1,0 +1,100 @@
+//! How far a straight's length may really stray where the linear covariance cannot say: bend on bend the other way, both
+//! angles and the straight between them can change together and leave nearly the same tube.
+//!
+//! Beside `structure`, for `fit`'s covariance: the length is moved and held, all else is fitted again to the sections, and
+//! where that costs one unit of chi-squared is its standard deviation (profile likelihood).
+
+use nalgebra::DMatrix;
+
+use super::evidence::Solved;
+use super::fit::{RadiusPrior, Way, descend};
+use super::model::{Parameter, TubeModel};
+use super::sections::CentreLine;
+
+/// A straight that by the linear covariance may be off by more than this is looked at, and any shorter than this, in tube
+/// radii: where it ends at 0 the linear covariance changes from one fit to the next.
+const SUSPECT_RADII: f64 = 0.05;
+const SHORT_RADII: f64 = 0.3;
+
+/// Halvings of the step, and steps of a fit.
+const HALVINGS: usize = 10;
+const STEPS: usize = 12;
+
+/// A value with its standard deviation as found by moving it.
+pub type Held = (Parameter, f64);
+
+/// Standard deviations of the lengths that the linear covariance may overstate. `correlation`: points that say one thing.
+pub fn lengths(line: &CentreLine, model: &TubeModel, correlation: f64, prior: Option<RadiusPrior>) -> Vec<Held> {
+    let parameters = model.parameters();
+    let solved = Solved::new(line, model, &parameters);
+    let unit = line.noise_mm * line.noise_mm * correlation;
+    let suspect = |(j, p): (usize, &Parameter)| {
+        let Parameter::Length(i) = *p else { return None };
+        let linear_mm = (solved.inverse[(j, j)] * unit).max(0.0).sqrt();
+        let most_mm = 2.0 * model.tube_radius_mm;
+        let unsure = linear_mm > SUSPECT_RADII * model.tube_radius_mm;
+        let short = model.lra.bends[i].length_mm < SHORT_RADII * model.tube_radius_mm;
+        (unsure || short).then_some((i, linear_mm.min(most_mm)))
+    };
+    let found = parameters.iter().enumerate().filter_map(suspect);
+    let cost = |i: usize, length_mm: f64| {
+        let mut moved = model.clone();
+        let change = length_mm - moved.lra.bends[i].length_mm;
+        // Both arcs give way to the straight, so that the start is near the valley.
+        let arcs = moved.lra.bends[i - 1].radius_mm + moved.lra.bends[i].radius_mm;
+        for bend in &mut moved.lra.bends[i - 1..=i] {
+            bend.angle_rad = (bend.angle_rad - change / arcs).max(1e-4);
+        }
+        moved.lra.bends[i].length_mm = length_mm;
+        let free: Vec<Parameter> = parameters.iter().copied().filter(|p| *p != Parameter::Length(i)).collect();
+        let way = Way { cutoff_mm: f64::INFINITY, noise_mm: line.noise_mm, steps: STEPS, goal: f64::INFINITY };
+        2.0 * descend(&mut line.clone(), moved, &free, prior, way).pass.cost / unit
+    };
+    let spread = |(i, linear_mm): (usize, f64)| {
+        let at = model.lra.bends[i].length_mm;
+        let least = cost(i, at);
+        let mut step = linear_mm;
+        for _ in 0..HALVINGS {
+            let excess = cost(i, at + step) - least;
+            if excess <= 1.0 {
+                break;
+            }
+            step *= 0.5;
+        }
+        (Parameter::Length(i), step)
+    };
+    found.map(spread).collect()
+}
+
+/// The covariance with what was found of single values: as if each had been measured once more, so that its own standard
+/// deviation becomes the one found.
+pub fn tightened(covariance: &DMatrix<f64>, parameters: &[Parameter], held: &[Held]) -> DMatrix<f64> {
+    let mut out = covariance.clone();
+    for (parameter, sigma) in held {
+        let Some(j) = parameters.iter().position(|p| p == parameter) else { continue };
+        let (own, wanted) = (out[(j, j)], sigma * sigma);
+        if own > wanted {
+            let column = out.column(j).into_owned();
+            out -= &column * column.transpose() * ((1.0 - wanted / own) / own);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_held_takes_its_partners_along() {
+        // Two values that differ surely by nothing, both unsure: holding one holds the other.
+        let covariance = DMatrix::from_row_slice(2, 2, &[4.0, 4.0, 4.0, 4.01]);
+        let parameters = [Parameter::Length(1), Parameter::Angle(1)];
+        let held = tightened(&covariance, &parameters, &[(Parameter::Length(1), 0.1)]);
+        assert!((held[(0, 0)] - 0.01).abs() < 1e-12);
+        assert!((held[(1, 1)] - 0.02).abs() < 1e-12);
+        // A wider one changes nothing.
+        let same = tightened(&covariance, &parameters, &[(Parameter::Length(1), 3.0)]);
+        assert_eq!(same, covariance);
+    }
+}
