@@ -351,11 +351,17 @@ fn measured_tube_reversed_is_its_table_reversed() {
         angle_sigma_rad: 0.001,
         radius_mm: Some(b.radius_mm),
         radius_sigma_mm: Some(0.05),
+        ovality: Some(b.radius_mm / 1000.0),
+        ovality_sigma: Some(0.001),
     };
     let json = serde_json::json!({
         "tube_radius_mm": 10.0, "last_length_mm": 40.0, "last_length_sigma_mm": 0.04,
         "bends": tube.bends.iter().map(bend).collect::<Vec<_>>(),
         "intersection_mm": [1.0, 2.0, null, 4.0], "intersection_sigma_mm": [0.1, 0.2, null, 0.4],
+        "decisions": [
+            {"what": "two bends instead of one", "bend": 1, "gain": 123.4, "kept": true},
+            {"what": "one CLR for all bends", "gain": -7.5, "kept": false},
+        ],
     });
     let measured: MeasuredTube = serde_json::from_value(json).unwrap();
     let back = measured.reversed();
@@ -363,6 +369,9 @@ fn measured_tube_reversed_is_its_table_reversed() {
     assert_eq!(back.intersection_mm, [Some(4.0), None, Some(2.0), Some(1.0)]);
     assert_eq!(back.bends[1].length_sigma_mm, Some(0.03), "a sigma travels with its value");
     assert_eq!(back.bends[0].rotation_sigma_rad, Some(0.0));
+    assert_eq!(back.bends[2].ovality, Some(0.03), "ovality belongs to its bend");
+    let about: Vec<Option<usize>> = back.decisions.iter().map(|d| d.bend).collect();
+    assert_eq!(about, [Some(3), None], "a decision goes with its bend");
     assert_eq!(back.reversed(), measured);
 }
 

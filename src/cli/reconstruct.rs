@@ -40,38 +40,56 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 /// The measured tube for people.
 pub fn table(tube: &MeasuredTube) -> String {
+    let sigma = tube.tube_radius_sigma_mm.map_or(String::new(), |s| format!(" ±{s:.3}"));
     let mut out = format!(
-        "tube radius {:.3} mm, {} of {} points used, median residual {:.3} mm, {:.0} ms\n",
+        "tube radius {:.3}{sigma} mm, {} of {} points used, median residual {:.3} mm, {:.0} ms\n",
         tube.tube_radius_mm, tube.points_used, tube.points_total, tube.residual_median_mm, tube.elapsed_ms
     );
     if tube.reversed == Some(true) {
         out += "the scan starts at the part's other end; turned round\n";
     }
-    out += "bend        length mm      rotation deg         angle deg            CLR mm\n";
+    // The column only where some bend has it.
+    let oval = tube.bends.iter().any(|b| b.ovality.is_some());
+    out += "bend        length mm      rotation deg         angle deg            CLR mm";
+    out += if oval { "        ovality %\n" } else { "\n" };
     for (i, b) in tube.bends.iter().enumerate() {
         let degrees = |rad: Option<f64>| rad.map(f64::to_degrees);
+        let percent = |share: Option<f64>| share.map(|s| 100.0 * s);
         out += &format!(
-            "{:>4} {} {} {} {}\n",
+            "{:>4} {} {} {} {}",
             i + 1,
             cell(b.length_mm, b.length_sigma_mm),
             cell(degrees(b.rotation_rad), degrees(b.rotation_sigma_rad)),
             cell(degrees(Some(b.angle_rad)), degrees(Some(b.angle_sigma_rad))),
             cell(b.radius_mm, b.radius_sigma_mm),
         );
+        if oval {
+            out += &format!(" {}", cell(percent(b.ovality), percent(b.ovality_sigma)));
+        }
+        out += "\n";
     }
     out += &format!(" end {}\n", cell(tube.last_length_mm, tube.last_length_sigma_mm));
+    out += &ends(tube);
+    for d in &tube.decisions {
+        let bend = d.bend.map_or(String::new(), |b| format!("bend {b}: "));
+        let verdict = if d.kept { "kept" } else { "not kept" };
+        out += &format!("decision: {bend}{}, gain {:.1}, {verdict}\n", d.what, d.gain);
+    }
+    tube.warnings.iter().for_each(|w| out += &format!("warning: {w}\n"));
+    out
+}
+
+/// How the ends are cut, where that was seen.
+fn ends(tube: &MeasuredTube) -> String {
     let cuts = [
         ("first", tube.first_cut_rad, tube.first_cut_sigma_rad),
         ("last", tube.last_cut_rad, tube.last_cut_sigma_rad),
     ];
-    for (which, cut, sigma) in cuts {
-        if let (Some(cut), Some(sigma)) = (cut, sigma) {
-            let (cut, sigma) = (cut.to_degrees(), sigma.to_degrees());
-            out += &format!("{which} end cut {cut:.2} ±{sigma:.2} degrees from square\n");
-        }
-    }
-    tube.warnings.iter().for_each(|w| out += &format!("warning: {w}\n"));
-    out
+    let line = |(which, cut, sigma): (&str, Option<f64>, Option<f64>)| {
+        let (cut, sigma) = (cut?.to_degrees(), sigma?.to_degrees());
+        Some(format!("{which} end cut {cut:.2} ±{sigma:.2} degrees from square\n"))
+    };
+    cuts.into_iter().filter_map(line).collect()
 }
 
 fn cell(value: Option<f64>, sigma: Option<f64>) -> String {

@@ -167,6 +167,8 @@ fn as_measured(lra: &Lra) -> MeasuredTube {
         angle_sigma_rad: 0.0,
         radius_mm: Some(b.radius_mm),
         radius_sigma_mm: None,
+        ovality: None,
+        ovality_sigma: None,
     };
     MeasuredTube {
         last_length_sigma_mm: Some(0.1),

@@ -52,6 +52,7 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
     let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
     MeasuredTube {
         tube_radius_mm: report.at.tube_radius[0],
+        tube_radius_sigma_mm: None,
         points_total: sample.points.len(),
         points_used: fit.used,
         residual_median_mm: 0.0,
@@ -67,6 +68,7 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
         last_cut_rad: last_cut.map(|c| c.0),
         last_cut_sigma_rad: last_cut.map(|c| c.1),
         reversed: None,
+        decisions: Vec::new(),
         warnings: report.warnings,
     }
 }
@@ -103,6 +105,8 @@ impl Report {
             angle_sigma_rad: self.sigma.angles[i],
             radius_mm: radius.map(|r| r.0),
             radius_sigma_mm: radius.map(|r| r.1),
+            ovality: None,
+            ovality_sigma: None,
         }
     }
 

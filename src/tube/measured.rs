@@ -33,6 +33,29 @@ pub struct MeasuredBend {
     /// Its sigma.
     #[serde(default)]
     pub radius_sigma_mm: Option<f64>,
+    /// Ovality of the section half way through the bend: largest less smallest diameter over the nominal one, positive
+    /// where the tube is flattened in the bend's plane (as a bend does), negative across it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ovality: Option<f64>,
+    /// Its sigma.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ovality_sigma: Option<f64>,
+}
+
+/// A choice about the tube's structure (a bend more or fewer, one CLR for all) and what spoke for it, so that a
+/// wrong number of bends can be understood.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Decision {
+    /// What was tried, in words: "two bends instead of one".
+    pub what: String,
+    /// The bend in the table that it is about, from 1; none where it is about the whole tube or a bend that is not there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bend: Option<usize>,
+    /// Evidence for what was tried over what was there before: fall of the squared residuals over the noise's
+    /// variance, less the price of the values added. Above 0 the data asks for it.
+    pub gain: f64,
+    /// Whether the table given has it.
+    pub kept: bool,
 }
 
 /// What one scan says of one tube.
@@ -40,6 +63,9 @@ pub struct MeasuredBend {
 pub struct MeasuredTube {
     /// Outer radius of the tube.
     pub tube_radius_mm: f64,
+    /// Its sigma.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tube_radius_sigma_mm: Option<f64>,
     /// Points in the scan after the door.
     #[serde(default)]
     pub points_total: usize,
@@ -99,6 +125,9 @@ pub struct MeasuredTube {
     /// With a nominal: whether the scan was turned round to its direction.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reversed: Option<bool>,
+    /// What was decided about the structure, in the order of the decisions.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub decisions: Vec<Decision>,
     /// What a reader should know before trusting the numbers.
     #[serde(default)]
     pub warnings: Vec<String>,
@@ -119,10 +148,13 @@ impl MeasuredTube {
             angle_sigma_rad: 0.0,
             radius_mm: Some(b.radius_mm),
             radius_sigma_mm: Some(0.0),
+            ovality: None,
+            ovality_sigma: None,
         };
         let corners = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
         MeasuredTube {
             tube_radius_mm,
+            tube_radius_sigma_mm: None,
             points_total: 0,
             points_used: 0,
             residual_median_mm: 0.0,
@@ -138,6 +170,7 @@ impl MeasuredTube {
             last_cut_rad: None,
             last_cut_sigma_rad: None,
             reversed: None,
+            decisions: Vec::new(),
             warnings: Vec::new(),
         }
     }
@@ -189,6 +222,9 @@ impl MeasuredTube {
         }
         out.intersection_mm.reverse();
         out.intersection_sigma_mm.reverse();
+        for bend in out.decisions.iter_mut().filter_map(|d| d.bend.as_mut()) {
+            *bend = (n + 1).saturating_sub(*bend);
+        }
         (out.first_cut_rad, out.first_cut_sigma_rad) = (self.last_cut_rad, self.last_cut_sigma_rad);
         (out.last_cut_rad, out.last_cut_sigma_rad) = (self.first_cut_rad, self.first_cut_sigma_rad);
         out

@@ -18,7 +18,7 @@ mod ybc;
 pub use limits::MachineLimits;
 pub use lra::{Bend, Lra, TubeError, wrap_angle};
 pub use material::Material;
-pub use measured::{MeasuredBend, MeasuredTube};
+pub use measured::{Decision, MeasuredBend, MeasuredTube};
 pub use nominal::{Alignment, Nominal, Tolerance};
 pub use polygon::{ControlPolygon, Corner, any_normal};
 pub use spine::{ClosestPoint, Frame, Segment, SegmentKind, Spine, StraightPoints};

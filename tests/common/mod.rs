@@ -18,6 +18,8 @@ pub fn measured(lra: &Lra, angle_sigma_deg: f64) -> MeasuredTube {
             angle_sigma_rad: sigma,
             radius_mm: Some(b.radius_mm),
             radius_sigma_mm: Some(0.08),
+            ovality: None,
+            ovality_sigma: None,
         }
     };
     let intersection_mm = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
