@@ -161,8 +161,8 @@ pub struct Way {
 }
 
 /// Steps after which a descent may be given up, and what it may still gain, in gains of its last step.
-const PATIENCE: usize = 2;
-const HOPE: f64 = 4.0;
+const PATIENCE: usize = 8;
+const HOPE: f64 = 10.0;
 
 /// Damping of the first step, of one that is as good as undamped, and from which on no step will help.
 const FIRST_DAMPING: f64 = 1e-6;

@@ -103,7 +103,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     }
     // Sigmas by what the points say together, not by their number (see `CentreLine::correlation`).
     best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
-    best.covariance *= CentreLine::measure(&all.points, &best.model).correlation(&best.model);
+    best.covariance *= CentreLine::measure(&all.points, &best.model, true).correlation(&best.model);
     let mut measured = measure::measure(&mut best, &mut all);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();

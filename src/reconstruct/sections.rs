@@ -29,6 +29,8 @@ const LONGEST_RADII: f64 = 2.0;
 
 /// What is expected of the values before anything is measured, in tube radii.
 const SPREADS: [f64; VALUES] = [0.01, 0.3, 0.3, 0.02, 0.02];
+/// The same about a base that has been fitted, radius and ovality and all.
+const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
 
 /// Points farther than this from the base tube do not count, in tube radii.
 const FIRST_CUTOFF: f64 = 0.4;
@@ -36,7 +38,7 @@ const FIRST_CUTOFF: f64 = 0.4;
 const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
 /// Noise over cut-off that is pretended while points are weighed.
-const FIRMNESS: f64 = 0.3;
+const FIRMNESS: f64 = 1.0;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 /// Median of |x| to standard deviation for normal errors.
@@ -121,8 +123,9 @@ impl CentreLine {
         CentreLine { count: sections.len() as f64, sections, radius_mm, noise_mm: 0.01 * radius_mm }
     }
 
-    /// Measures the sections of a tube that lies near `base`.
-    pub fn measure(points: &[Point3<f64>], base: &TubeModel) -> CentreLine {
+    /// Measures the sections of a tube that lies near `base`: one that the polygon gave, or one that was fitted.
+    pub fn measure(points: &[Point3<f64>], base: &TubeModel, fitted: bool) -> CentreLine {
+        let spreads = if fitted { FITTED_SPREADS } else { SPREADS }.map(|s| s * base.tube_radius_mm);
         let spine = base.spine();
         let per_radius = points.len() as f64 * base.tube_radius_mm / spine.length_mm().max(1e-9);
         let radii = (ENOUGH_POINTS / per_radius).clamp(SECTION_RADII, LONGEST_RADII);
@@ -136,7 +139,7 @@ impl CentreLine {
             for (fit, seen) in fits.iter_mut().zip(&grouped) {
                 // Weighing, a section must not swing after a flying point where it sees nothing else: held more firmly
                 // than the noise asks for.
-                *fit = solve(&sums(seen, fit, cutoff), base.tube_radius_mm, FIRMNESS * cutoff);
+                *fit = solve(&sums(seen, fit, cutoff), &spreads, FIRMNESS * cutoff);
             }
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
@@ -154,7 +157,7 @@ impl CentreLine {
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
             let oval_mm = [oval(base, place, along), 0.0];
             doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, segment.start_mm + along));
-            let best = solve(&sums, base.tube_radius_mm, noise);
+            let best = solve(&sums, &SPREADS.map(|s| s * base.tube_radius_mm), noise);
             let least = cost(&sums, &best).max(0.0);
             sections.push(Section {
                 centre: frame.translation.vector.into(),
@@ -322,10 +325,10 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
 }
 
 /// The values that fit best, held by what is expected where the points do not tell.
-fn solve(sums: &Sums, radius_mm: f64, noise_mm: f64) -> Values {
+fn solve(sums: &Sums, spreads_mm: &[f64; VALUES], noise_mm: f64) -> Values {
     let mut square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
-    for (k, spread) in SPREADS.iter().enumerate() {
-        square[(k, k)] += (noise_mm / (spread * radius_mm)).powi(2);
+    for (k, spread) in spreads_mm.iter().enumerate() {
+        square[(k, k)] += (noise_mm / spread).powi(2);
     }
     let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
     Cholesky::new(square).map_or(Values::zeros(), |c| c.solve(&mixed))

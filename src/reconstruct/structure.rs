@@ -45,8 +45,8 @@ const ROUNDS: usize = 20;
 const MEASUREMENTS: usize = 4;
 
 /// Steps of a fit, and of one that only has to show whether a change is worth it.
-const FULL_STEPS: usize = 40;
-const TRIAL_STEPS: usize = 20;
+const FULL_STEPS: usize = 100;
+const TRIAL_STEPS: usize = 40;
 
 /// A fitted structure.
 #[derive(Debug, Clone)]
@@ -87,7 +87,7 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
         TOLERANCES.iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
     let rough: Vec<Candidate> = starts.iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
     let first = rough.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
-    jury.line = CentreLine::measure(sample, &first.model);
+    jury.line = CentreLine::measure(sample, &first.model, false);
     let fitted: Vec<Candidate> =
         rough.par_iter().map(|c| jury.fit(&c.model, FULL_STEPS, f64::INFINITY)).collect();
     let clearest = fitted.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
@@ -96,7 +96,7 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
     let mut best =
         fitted.iter().map(|c| jury.judge(c.model.clone())).min_by(|a, b| a.score.total_cmp(&b.score))?;
     for _ in 0..MEASUREMENTS {
-        jury.line = CentreLine::measure(sample, &best.model);
+        jury.line = CentreLine::measure(sample, &best.model, true);
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
         jury.correlation = jury.line.correlation(&best.model);
         best = jury.judge(best.model);
