@@ -12,6 +12,7 @@ use crate::tube::{Frame, MeasuredBend, MeasuredTube, Spine};
 const MAX_LENGTH_SIGMA_MM: f64 = 5.0;
 const MAX_ROTATION_SIGMA_RAD: f64 = 45.0 * std::f64::consts::PI / 180.0;
 const MAX_RADIUS_SIGMA_SHARE: f64 = 0.5;
+const MAX_OVALITY_SIGMA: f64 = 0.02;
 
 /// Both ends found on the scan, in space.
 #[derive(Default)]
@@ -34,6 +35,8 @@ pub(super) struct Values {
     pub angles: Vec<f64>,
     pub radii: Vec<f64>,
     pub corners: Vec<f64>,
+    /// Largest less smallest diameter over the nominal one, positive where flattened in the bend's plane.
+    pub ovalities: Vec<f64>,
     pub tube_radius: Vec<f64>,
 }
 
@@ -52,7 +55,7 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
     let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
     MeasuredTube {
         tube_radius_mm: report.at.tube_radius[0],
-        tube_radius_sigma_mm: None,
+        tube_radius_sigma_mm: Some(report.sigma.tube_radius[0]),
         points_total: sample.points.len(),
         points_used: fit.used,
         residual_median_mm: 0.0,
@@ -96,6 +99,9 @@ impl Report {
         let length = self.length(i);
         let rotation = self.rotation(i);
         let radius = self.radius(i);
+        // Less certain than this it says nothing of the bend's quality; no warning, since nothing else depends on it.
+        let ovality = Some((self.at.ovalities[i], self.sigma.ovalities[i]));
+        let ovality = ovality.filter(|(_, sigma)| *sigma < MAX_OVALITY_SIGMA);
         MeasuredBend {
             length_mm: length.map(|l| l.0),
             length_sigma_mm: length.map(|l| l.1),
@@ -105,8 +111,8 @@ impl Report {
             angle_sigma_rad: self.sigma.angles[i],
             radius_mm: radius.map(|r| r.0),
             radius_sigma_mm: radius.map(|r| r.1),
-            ovality: None,
-            ovality_sigma: None,
+            ovality: ovality.map(|o| o.0),
+            ovality_sigma: ovality.map(|o| o.1),
         }
     }
 
@@ -255,6 +261,7 @@ pub(super) fn values(model: &TubeModel, ends: &Ends) -> Values {
         rotations: model.lra.bends.iter().map(|b| b.rotation_rad).collect(),
         angles: model.lra.bends.iter().map(|b| b.angle_rad).collect(),
         radii: model.lra.bends.iter().map(|b| b.radius_mm).collect(),
+        ovalities: model.ovality_mm.iter().map(|e| -2.0 * e / model.tube_radius_mm).collect(),
         tube_radius: vec![model.tube_radius_mm],
         lengths,
     }
@@ -268,8 +275,15 @@ fn along(spine: &Spine, index: usize, end: &Point3<f64>, sign: f64) -> f64 {
 
 impl Values {
     fn flat(&self) -> Vec<f64> {
-        let parts =
-            [&self.lengths, &self.rotations, &self.angles, &self.radii, &self.corners, &self.tube_radius];
+        let parts = [
+            &self.lengths,
+            &self.rotations,
+            &self.angles,
+            &self.radii,
+            &self.corners,
+            &self.ovalities,
+            &self.tube_radius,
+        ];
         parts.into_iter().flatten().copied().collect()
     }
 
@@ -283,6 +297,7 @@ impl Values {
             angles: take(&self.angles),
             radii: take(&self.radii),
             corners: take(&self.corners),
+            ovalities: take(&self.ovalities),
             tube_radius: take(&self.tube_radius),
         }
     }

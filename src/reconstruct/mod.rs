@@ -113,6 +113,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
     let mut used: Vec<f64> =
         own_residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
+    measured.decisions = chosen.decisions;
     measured.points_total = cloud.len();
     measured.warnings.splice(0..0, scene.warnings);
     // The points of the surroundings have a distance from the tube too.

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
 use super::evidence::{Joint, Solved};
-use super::fit::{CUTOFF_SIGMAS, Descent, Effort, RadiusPrior, Way, descend, fit};
+use super::fit::{CUTOFF_SIGMAS, Descent, Effort, Fit, RadiusPrior, Way, descend, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::{
@@ -17,6 +17,7 @@ use super::moves::{
 use super::profile::{Held, lengths};
 use super::sections::CentreLine;
 use super::simplify::simplify;
+use crate::tube::Decision;
 
 /// Tolerances of the polygon in tube radii; the spine's own shrinkage in bends is 0.038 (paper 000, section 3.2).
 const TOLERANCES: [f64; 4] = [0.03, 0.05, 0.08, 0.13];
@@ -35,6 +36,9 @@ const RADIUS_SPREAD: f64 = 0.3;
 
 /// A value this many times less certain than what it costs would still be spent is tried without.
 const DOUBT: f64 = 4.0;
+
+/// Changes turned down at the end that are remembered.
+const REMEMBERED: usize = 5;
 
 /// Gain of a joint, per independent point, that makes a bend be tried there.
 const JOINT_GAIN: f64 = 30.0;
@@ -70,6 +74,8 @@ pub struct Structure {
     pub prior: Option<RadiusPrior>,
     /// What the linear covariance overstates.
     pub held: Vec<Held>,
+    /// How it came about, and what was turned down at the end.
+    pub decisions: Vec<Decision>,
 }
 
 /// The data and what all candidates share.
@@ -78,11 +84,26 @@ struct Jury {
     /// How many points say one thing.
     correlation: f64,
     prior: Option<RadiusPrior>,
+    decisions: Vec<Decision>,
+}
+
+/// A change to be tried.
+struct Change {
+    /// In words.
+    what: String,
+    /// The bend of the tube as it is, counted from 0.
+    bend: Option<usize>,
+    model: TubeModel,
 }
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -> Option<Structure> {
-    let mut jury = Jury { line: CentreLine::of_polygon(polygon, radius_mm), correlation: 1.0, prior: None };
+    let mut jury = Jury {
+        line: CentreLine::of_polygon(polygon, radius_mm),
+        correlation: 1.0,
+        prior: None,
+        decisions: Vec::new(),
+    };
     let starts: Vec<TubeModel> =
         TOLERANCES.iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
     let rough: Vec<Candidate> = starts.iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
@@ -107,10 +128,14 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
             break;
         }
     }
-    let common = jury.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
-    if common.score < best.score {
-        // With one radius neighbours may turn out to be one bend.
-        best = jury.search(common);
+    if best.model.lra.bends.len() > 1 {
+        let common = jury.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
+        let gain = best.score - common.score;
+        jury.decide("one CLR for all bends".to_owned(), None, gain, gain > 0.0);
+        if gain > 0.0 {
+            // With one radius neighbours may turn out to be one bend.
+            best = jury.search(common);
+        }
     }
     Some(jury.confirmed(sample, best.model))
 }
@@ -152,29 +177,43 @@ impl Jury {
         parameters as f64 * (self.line.count / self.correlation).max(2.0).ln()
     }
 
-    /// Changes the best candidate as long as it gets better.
-    fn search(&self, mut best: Candidate) -> Candidate {
+    fn decide(&mut self, what: String, bend: Option<usize>, gain: f64, kept: bool) {
+        self.decisions.push(Decision { what, bend: bend.map(|i| i + 1), gain, kept });
+    }
+
+    /// Changes the best candidate as long as it gets better. Of the changes turned down in the last round the likeliest
+    /// are remembered.
+    fn search(&mut self, mut best: Candidate) -> Candidate {
         for _ in 0..ROUNDS {
-            let Some(better) = self.improve(&best) else { break };
-            best = self.fit(&better.model, FULL_STEPS, f64::INFINITY);
+            let mut tried = self.tried(&best);
+            tried.sort_by(|a, b| a.1.score.total_cmp(&b.1.score));
+            let better = tried.first().is_some_and(|(_, c)| c.score < best.score - LEAST_GAIN);
+            if !better {
+                self.decisions.retain(|d| d.kept);
+                for (change, candidate) in tried.into_iter().take(REMEMBERED) {
+                    self.decide(change.what, change.bend, best.score - candidate.score, false);
+                }
+                break;
+            }
+            let (change, candidate) = tried.swap_remove(0);
+            self.decide(change.what, None, best.score - candidate.score, true);
+            best = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
         }
         best
     }
 
-    /// The best of all changes by one bend, when it scores better.
-    fn improve(&self, best: &Candidate) -> Option<Candidate> {
-        let tried = self.changes(best);
-        tried
-            .into_par_iter()
-            .map(|m| self.fit(&m, TRIAL_STEPS, best.score))
-            .collect::<Vec<_>>()
-            .into_iter()
-            .filter(|c| c.score < best.score - LEAST_GAIN)
-            .min_by(|a, b| a.score.total_cmp(&b.score))
+    /// All changes by one bend that may be worth it, each fitted.
+    fn tried(&self, best: &Candidate) -> Vec<(Change, Candidate)> {
+        let changes = self.changes(best);
+        let fit = |change: Change| {
+            let candidate = self.fit(&change.model, TRIAL_STEPS, best.score);
+            (change, candidate)
+        };
+        changes.into_par_iter().map(fit).collect()
     }
 
     /// The changes that may be worth it.
-    fn changes(&self, best: &Candidate) -> Vec<TubeModel> {
+    fn changes(&self, best: &Candidate) -> Vec<Change> {
         let model = &best.model;
         let n = model.lra.bends.len();
         let solved = Solved::new(&self.line, model, &best.parameters);
@@ -186,54 +225,75 @@ impl Jury {
         };
         let bearable = DOUBT * self.price(5);
         let bends = &model.lra.bends;
+        let spine = model.spine();
+        let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
+        let change = |what: String, bend: Option<usize>, model: TubeModel| Change { what, bend, model };
         let shallow = |i: &usize| worth(Parameter::Angle(*i), bends[*i].angle_rad) < bearable;
-        let dropped = (0..n).filter(shallow).map(|i| without_bend(model, i));
-        let merged = likeliest_pairs(model).into_iter().filter_map(|i| merged(model, i));
+        let dropped = (0..n).filter(shallow).map(|i| {
+            change(format!("the bend at {:.0} mm pulled straight", at(i)), Some(i), without_bend(model, i))
+        });
+        let merged = likeliest_pairs(model).into_iter().filter_map(|i| {
+            let what = format!("the bends at {:.0} and {:.0} mm made one", at(i - 1), at(i));
+            Some(change(what, Some(i - 1), merged(model, i)?))
+        });
         let joints = self.joints(best, &solved);
-        let inserted = joints.iter().flat_map(|j| with_bend(model, j));
-        let split = joints.iter().flat_map(|j| split(model, j));
-        let doubled = (0..n).filter_map(|i| doubled(model, i));
+        let inserted = joints.iter().flat_map(|j| {
+            let what = format!("a bend put in at {:.0} mm", j.at_mm);
+            with_bend(model, j).into_iter().map(move |m| change(what.clone(), None, m))
+        });
+        let split = joints.iter().flat_map(|j| {
+            let what = format!("the bend at {:.0} mm made two", j.at_mm);
+            split(model, j).into_iter().map(move |m| change(what.clone(), None, m))
+        });
+        let doubled = (0..n).filter_map(|i| {
+            let what = format!("the wide bend at {:.0} mm made two of the usual CLR", at(i));
+            Some(change(what, Some(i), doubled(model, i)?))
+        });
         let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled);
-        all.filter(|m| m.lra.bends.len() <= MOST_BENDS).collect()
+        all.filter(|c| c.model.lra.bends.len() <= MOST_BENDS).collect()
     }
 
     /// What is handed on.
-    fn structure(&self, model: TubeModel) -> Structure {
+    fn structure(self, model: TubeModel) -> Structure {
         let held = lengths(&self.line, &model, self.correlation, self.prior);
-        Structure { noise_mm: self.line.noise_mm, prior: self.prior, held, model }
+        let (noise_mm, prior, decisions) = (self.line.noise_mm, self.prior, self.decisions);
+        Structure { noise_mm, prior, held, decisions, model }
     }
 
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
     /// points may have taken some that are not the tube's for its own.
-    fn confirmed(&self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
+    fn confirmed(mut self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
         let mut sample = Sample::new(sample.to_vec(), &model);
-        let noise_mm = self.line.noise_mm;
-        let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
-        let effort = Effort { cutoff_mm, rounds: 0, steps: FULL_STEPS, prior: self.prior };
-        let mut fit_points = |model: &TubeModel| {
-            let found = fit(&mut sample, model, effort);
-            let misfit = 2.0 * found.cost / (noise_mm * noise_mm) / self.correlation;
-            let score = misfit + self.price(found.parameters.len());
-            (found, score)
-        };
-        let (mut best, mut score) = fit_points(&model);
+        let (mut best, mut score) = self.fit_points(&mut sample, &model);
         loop {
             let bends = &best.model.lra.bends;
-            let bearable = DOUBT * self.price(5);
+            let bearable = DOUBT * self.price(5) * self.correlation;
             let doubtful = |i: &usize| {
                 let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
-                at.is_some_and(|j| {
-                    bends[*i].angle_rad.powi(2) < bearable * self.correlation * best.covariance[(j, j)]
-                })
+                at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
             };
-            let less: Vec<TubeModel> =
-                (0..bends.len()).filter(doubtful).map(|i| without_bend(&best.model, i)).collect();
-            let fits = less.iter().map(&mut fit_points);
-            match fits.min_by(|a, b| a.1.total_cmp(&b.1)) {
-                Some(better) if better.1 < score => (best, score) = better,
-                _ => return self.structure(best.model),
-            }
+            let mut less: Vec<(usize, (Fit, f64))> = (0..bends.len())
+                .filter(doubtful)
+                .map(|i| (i, self.fit_points(&mut sample, &without_bend(&best.model, i))))
+                .collect();
+            less.sort_by(|a, b| a.1.1.total_cmp(&b.1.1));
+            let Some((i, better)) = less.into_iter().next().filter(|l| l.1.1 < score) else {
+                return self.structure(best.model);
+            };
+            let at_mm = best.model.spine().segments()[2 * i + 1].start_mm;
+            let what = format!("the bend at {at_mm:.0} mm, not confirmed by the points, pulled straight");
+            self.decide(what, None, score - better.1, true);
+            (best, score) = better;
         }
+    }
+
+    fn fit_points(&self, sample: &mut Sample, model: &TubeModel) -> (Fit, f64) {
+        let noise_mm = self.line.noise_mm;
+        let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
+        let found = fit(sample, model, Effort { cutoff_mm, rounds: 0, steps: FULL_STEPS, prior: self.prior });
+        let misfit = 2.0 * found.cost / (noise_mm * noise_mm) / self.correlation;
+        let score = misfit + self.price(found.parameters.len());
+        (found, score)
     }
 
     /// Places where a joint would help, the most helpful first, no two close together.
