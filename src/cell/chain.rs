@@ -14,6 +14,7 @@ use crate::reconstruct::{Options, Reconstruction, Stage, reconstruct_watched};
 use crate::tube::{MachineLimits, MeasuredTube, Nominal};
 
 /// A scan and what it says.
+#[derive(Debug, Clone)]
 pub struct MeasuredScan {
     /// The points.
     pub cloud: PointCloud,

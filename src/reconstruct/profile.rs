@@ -24,7 +24,12 @@ const STEPS: usize = 12;
 pub type Held = (Parameter, f64);
 
 /// Standard deviations of the lengths that the linear covariance may overstate. `correlation`: points that say one thing.
-pub fn lengths(line: &CentreLine, model: &TubeModel, correlation: f64, prior: Option<RadiusPrior>) -> Vec<Held> {
+pub fn lengths(
+    line: &CentreLine,
+    model: &TubeModel,
+    correlation: f64,
+    prior: Option<RadiusPrior>,
+) -> Vec<Held> {
     let parameters = model.parameters();
     let solved = Solved::new(line, model, &parameters);
     let unit = line.noise_mm * line.noise_mm * correlation;
@@ -46,8 +51,10 @@ pub fn lengths(line: &CentreLine, model: &TubeModel, correlation: f64, prior: Op
             bend.angle_rad = (bend.angle_rad - change / arcs).max(1e-4);
         }
         moved.lra.bends[i].length_mm = length_mm;
-        let free: Vec<Parameter> = parameters.iter().copied().filter(|p| *p != Parameter::Length(i)).collect();
-        let way = Way { cutoff_mm: f64::INFINITY, noise_mm: line.noise_mm, steps: STEPS, goal: f64::INFINITY };
+        let free: Vec<Parameter> =
+            parameters.iter().copied().filter(|p| *p != Parameter::Length(i)).collect();
+        let way =
+            Way { cutoff_mm: f64::INFINITY, noise_mm: line.noise_mm, steps: STEPS, goal: f64::INFINITY };
         2.0 * descend(&mut line.clone(), moved, &free, prior, way).pass.cost / unit
     };
     let spread = |(i, linear_mm): (usize, f64)| {

@@ -59,6 +59,14 @@ impl Scale {
         Scale { noise_mm, limit_mm, near_mm: limit_mm.max(found.measured.tube_radius_mm / 4.0) }
     }
 
+    /// A scale of its own for means of deviations: 98 of 100 within, and 3 sigma of a mean of `count` points at least.
+    pub(super) fn of_means(&self, means_mm: &[f64], count: f64) -> Scale {
+        let mut sizes: Vec<f64> = means_mm.iter().map(|m| m.abs()).collect();
+        sizes.sort_unstable_by(f64::total_cmp);
+        let most = sizes.get((0.98 * sizes.len() as f64) as usize).copied().unwrap_or(0.0);
+        Scale { limit_mm: most.max(3.0 * self.noise_mm / count.max(1.0).sqrt()).max(1e-6), ..*self }
+    }
+
     /// Colour of a point, by its deviation.
     pub fn colour(&self, deviation_mm: f64) -> [u8; 3] {
         if deviation_mm.abs() <= self.near_mm { tint(deviation_mm / self.limit_mm) } else { OTHER }
@@ -89,7 +97,7 @@ impl Scale {
             let words = format!("{sign}{:.3}", (share * self.limit_mm).abs());
             text(svg, at, y + 29.0, &format!("{small}=\"middle\""), &words)?;
         }
-        text(svg, x - 24.0, y + 11.0, &format!("{small}=\"end\""), "inside the fitted surface")?;
+        text(svg, x - 24.0, y + 11.0, &format!("{small}=\"end\""), "inside the surface")?;
         text(svg, x + width + 24.0, y + 11.0, &format!("{small}=\"start\""), "outside (mm)")
     }
 }

@@ -62,7 +62,7 @@ fn axis(svg: &mut String, span: f64, x: impl Fn(f64) -> f64) -> Result {
     let (values, digits) = ticks(-span, span, 9.0);
     for mm in values {
         line(svg, (x(mm), BOTTOM), (x(mm), BOTTOM + 5.0), "stroke=\"#8c959f\"")?;
-        let words = format!("{:+.digits$}", mm + 0.0);
+        let words = if mm == 0.0 { "0".to_owned() } else { format!("{mm:+.digits$}") };
         text(svg, x(mm), BOTTOM + 19.0, "text-anchor=\"middle\" font-size=\"12\" fill=\"#57606a\"", &words)?;
     }
     let middle = (LEFT + RIGHT) / 2.0;
@@ -80,15 +80,14 @@ fn words(
     scale: &Scale,
 ) -> Result {
     let share = |n: usize| 100.0 * n as f64 / total.max(1) as f64;
-    let mut lines =
-        vec![format!("{total} points on the tube, sigma {:.4} mm (from the median)", scale.noise_mm)];
+    let mut lines = vec![format!("{total} points, sigma {:.4} mm (by the median)", scale.noise_mm)];
     for ((n, k), normal) in within.into_iter().zip(1..).zip([68.3, 95.4, 99.7]) {
         lines.push(format!("within {k} sigma: {:.1} %  (pure noise: {normal} %)", share(n)));
     }
     lines.push(format!("beyond the picture (±{span:.3} mm): {beyond}"));
     lines.push("dashed: pure noise of that sigma".to_owned());
     for (k, words) in lines.iter().enumerate() {
-        text(svg, RIGHT + 40.0, TOP + 30.0 + 24.0 * k as f64, "", words)?;
+        text(svg, RIGHT + 30.0, TOP + 30.0 + 24.0 * k as f64, "", words)?;
     }
     Ok(())
 }

@@ -150,19 +150,19 @@ fn pictures(page: &mut String, found: &Reconstruction, surface: &Surface, scale:
     writeln!(
         page,
         "<p class=\"quiet\">Scanned points that face the eye; pale tube: not scanned there. Dash-dotted: centre line. \
-         White circles: tangent points. Numbers: bends. Grey points: not the tube.</p>\n</section>"
+         White circles: tangent points. Numbers: bends. Dark grey points: not the tube. The fitted bends may be oval.</p>\n</section>"
     )?;
     writeln!(page, "<section>\n<h2>The surface unrolled</h2>")?;
     svg.clear();
     unrolled::draw(&mut svg, &found.spine, surface, scale, radius_mm)?;
-    figure(page, 385.0, &svg)?;
-    figure(page, 40.0, &bar)?;
+    figure(page, unrolled::HEIGHT, &svg)?;
     writeln!(
         page,
-        "<p class=\"quiet\">Mean deviation per cell; white: not scanned. Between the lines of a bend, solid: its inner side, \
-         dashed: its outer side. 0° is the inner side of the first bend, carried along without twist; the angle grows \
-         clockwise in the direction of travel. A bend that is oval has one colour at its inner and outer side and the \
-         other between them; a dent or flat is a blue patch; passes that disagree make stripes along the tube.</p>\n</section>"
+        "<p class=\"quiet\">Deviation from a round tube of the measured radius, mean of each cell, on a scale of its own; white: \
+         not scanned. Between the lines of a bend, solid: its inner side, dashed: its outer side. 0° is the inner side of the \
+         first bend, carried along without twist; the angle grows clockwise in the direction of travel. An oval bend has one \
+         colour at its inner and outer side and the other between them; a dent or flat is a blue patch; passes that disagree \
+         make stripes along the tube.</p>\n</section>"
     )?;
     writeln!(page, "<section>\n<h2>How the deviations are spread</h2>")?;
     svg.clear();

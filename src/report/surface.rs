@@ -24,8 +24,10 @@ pub struct Spot {
     /// Angle around the tube in [-pi, pi), carried along it without twist; 0 is the inner side of the first bend, and seen in
     /// the direction of travel it grows clockwise.
     pub around_rad: f64,
-    /// Signed distance from the fitted surface, positive outside.
+    /// Signed distance from the fitted surface (its bends as oval as they were found), positive outside.
     pub deviation_mm: f64,
+    /// Signed distance from a round tube of the same radius and centre line.
+    pub from_round_mm: f64,
 }
 
 /// The scan as pictures need it: not more points than a picture can show.
@@ -44,7 +46,11 @@ impl Surface {
         let turns_rad = turns(&found.spine);
         let (near, far): (Vec<usize>, Vec<usize>) =
             thin(cloud.len(), most).partition(|&i| found.residuals_mm[i].abs() <= scale.near_mm);
-        let spot = |&i: &usize| spot(&found.spine, &turns_rad, cloud.point(i), found.residuals_mm[i]);
+        let radius_mm = found.measured.tube_radius_mm;
+        let spot = |&i: &usize| Spot {
+            deviation_mm: found.residuals_mm[i],
+            ..Spot::of(&found.spine, &turns_rad, radius_mm, cloud.point(i))
+        };
         let spots = near.par_iter().map(spot).collect();
         Surface { spots, others: far.into_iter().map(|i| cloud.point(i)).collect(), turns_rad }
     }
@@ -78,18 +84,23 @@ fn turns(spine: &Spine) -> Vec<f64> {
     spine.segments().iter().map(&mut at).collect()
 }
 
-fn spot(spine: &Spine, turns_rad: &[f64], point: Point3<f64>, deviation_mm: f64) -> Spot {
-    let foot = spine.closest(&point);
-    let segment = &spine.segments()[foot.segment];
-    let local =
-        segment.frame_at(foot.arc_length_mm - segment.start_mm).inverse_transform_point(&point).coords;
-    Spot {
-        point,
-        outward: (point - foot.point).try_normalize(0.0).unwrap_or_default(),
-        segment: foot.segment,
-        along_mm: foot.arc_length_mm,
-        around_rad: wrapped(local.z.atan2(local.y) + turns_rad[foot.segment]),
-        deviation_mm,
+impl Spot {
+    /// As if the fitted surface were round.
+    fn of(spine: &Spine, turns_rad: &[f64], radius_mm: f64, point: Point3<f64>) -> Spot {
+        let foot = spine.closest(&point);
+        let segment = &spine.segments()[foot.segment];
+        let frame = segment.frame_at(foot.arc_length_mm - segment.start_mm);
+        let local = frame.inverse_transform_point(&point).coords;
+        let from_round_mm = foot.distance_mm - radius_mm;
+        Spot {
+            point,
+            outward: (point - foot.point).try_normalize(0.0).unwrap_or_default(),
+            segment: foot.segment,
+            along_mm: foot.arc_length_mm,
+            around_rad: wrapped(local.z.atan2(local.y) + turns_rad[foot.segment]),
+            deviation_mm: from_round_mm,
+            from_round_mm,
+        }
     }
 }
 
@@ -113,8 +124,9 @@ mod tests {
         // The inner side of the second bend lies a quarter round from that of the first.
         let arc = &spine.segments()[3];
         let inner = arc.frame_at(10.0) * Point3::new(0.0, 5.0, 0.0);
-        let spot = spot(&spine, &turns, inner, 0.0);
+        let spot = Spot::of(&spine, &turns, 6.0, inner);
         assert_eq!(spot.segment, 3);
+        assert!((spot.from_round_mm + 1.0).abs() < 1e-9, "a millimetre inside");
         assert!(
             (spot.around_rad - FRAC_PI_2).abs() < 1e-9 && (spot.along_mm - arc.start_mm - 10.0).abs() < 1e-9
         );

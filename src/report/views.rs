@@ -59,8 +59,8 @@ pub fn draw(
     let (views, height) = lay_out(spine, &spots, radius_mm);
     for view in &views {
         let (x, y) = (view.middle.0 - view.half.0 + 6.0, view.middle.1 - view.half.1 + 16.0);
-        text(svg, x, y, "fill=\"#57606a\"", view.title)?;
         dots(svg, view, others.iter(), "#b9bfc6")?;
+        text(svg, x, y, "class=\"halo\" fill=\"#57606a\"", view.title)?;
         tube(svg, view, spine, &spots, scale, radius_mm)?;
         marks(svg, view, spine, radius_mm)?;
     }
