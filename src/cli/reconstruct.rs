@@ -40,15 +40,16 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     progress.stage("reading the scan");
     let scan = measure_scan(&args.scan, args.unit.into(), nominal.as_ref(), &mut |s| progress.stage(name(s)));
     let scan = scan.map_err(anyhow::Error::msg)?;
-    let file = args.scan.display().to_string();
-    progress.stage("writing the exports");
-    let part = nominal.as_ref().map(|n| n.name.as_str());
-    let exported = args.export.iter().try_for_each(|e| e.write(&file, part, &scan));
     drop(progress);
-    // The measurement is worth having whatever became of the exports.
+    // The measurement first: it is worth having whatever becomes of the exports.
     let measured = &scan.found.measured;
     say(&if args.json { serde_json::to_string(measured)? } else { table(measured) });
-    exported.map(|()| Outcome::Done)
+    let progress = Progress::new(!args.json);
+    progress.stage("writing the exports");
+    let file = args.scan.display().to_string();
+    let part = nominal.as_ref().map(|n| n.name.as_str());
+    args.export.iter().try_for_each(|e| e.write(&file, part, &scan))?;
+    Ok(Outcome::Done)
 }
 
 /// A stage for people.
