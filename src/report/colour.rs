@@ -56,7 +56,7 @@ impl Scale {
             if used > 0 { *sizes.select_nth_unstable_by(place, f64::total_cmp).1 } else { f64::INFINITY };
         let most = if most.is_finite() { most } else { 0.0 };
         let limit_mm = most.max(3.0 * noise_mm).max(1e-6);
-        Scale { noise_mm, limit_mm, near_mm: limit_mm.max(found.measured.tube_radius_mm / 4.0) }
+        Scale { noise_mm, limit_mm, near_mm: (1.5 * limit_mm).max(found.measured.tube_radius_mm / 4.0) }
     }
 
     /// A scale of its own for means of deviations: 98 of 100 within, and 3 sigma of a mean of `count` points at least.

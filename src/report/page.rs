@@ -21,9 +21,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 14px 3px 0; text-align: right; border-bottom: 1px solid #d8dee4; }
 th { font-weight: 600; } td.words, th.words { text-align: left; } .sigma { color: #57606a; }
 .warnings { border-left: 4px solid #bf8700; padding: 2px 12px; background: #fff8e5; }
-svg { display: block; width: 100%; height: auto; } svg text { font-size: 13px; fill: #24292f; }
-svg text[font-size] { font-size: 12px; } svg text[fill='#57606a'] { fill: #57606a; }
-svg text[fill='#ffffff'] { fill: #ffffff; }
+svg { display: block; width: 100%; height: auto; }
 svg .halo { paint-order: stroke; stroke: #ffffff; stroke-width: 3px; }
 @media print { body { margin: 0; max-width: none; -webkit-print-color-adjust: exact; print-color-adjust: exact; }
   section { break-inside: avoid; } }
@@ -159,8 +157,8 @@ fn pictures(page: &mut String, found: &Reconstruction, surface: &Surface, scale:
     writeln!(
         page,
         "<p class=\"quiet\">Deviation from a round tube of the measured radius, mean of each cell, on a scale of its own; white: \
-         not scanned. Between the lines of a bend, solid: its inner side, dashed: its outer side. 0° is the inner side of the \
-         first bend, carried along without twist; the angle grows clockwise in the direction of travel. An oval bend has one \
+         not scanned, or nothing near the surface. Between the lines of a bend, solid: its inner side, dashed: its outer \
+         side. 0° is the inner side of the first bend, carried along without twist; the angle grows clockwise in the direction of travel. An oval bend has one \
          colour at its inner and outer side and the other between them; a dent or flat is a blue patch; passes that disagree \
          make stripes along the tube.</p>\n</section>"
     )?;
@@ -172,7 +170,8 @@ fn pictures(page: &mut String, found: &Reconstruction, surface: &Surface, scale:
 }
 
 fn figure(page: &mut String, height: f64, svg: &str) -> Result {
-    writeln!(page, "<svg viewBox=\"0 0 1100 {height:.0}\" role=\"img\">\n{svg}</svg>")
+    let style = "role=\"img\" font-size=\"13\" fill=\"#24292f\"";
+    writeln!(page, "<svg viewBox=\"0 0 1100 {height:.0}\" {style}>\n{svg}</svg>")
 }
 
 fn decisions(page: &mut String, tube: &MeasuredTube) -> Result {

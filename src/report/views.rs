@@ -17,7 +17,7 @@ const MOST_OTHERS: usize = 3_000;
 const WIDTH: f64 = 1100.0;
 const MOST_HIGH: f64 = 620.0;
 /// Around every view, for numbers.
-const MARGIN: f64 = 34.0;
+const MARGIN: f64 = 44.0;
 
 /// Looking at the tube from one side.
 struct View {
@@ -32,6 +32,8 @@ struct View {
     /// Half its width and height.
     half: (f64, f64),
     scale: f64,
+    /// Width of a point's dot.
+    dot: f64,
 }
 
 impl View {
@@ -58,7 +60,7 @@ pub fn draw(
         thin(surface.others.len(), MOST_OTHERS).map(|i| surface.others[i]).collect();
     let (views, height) = lay_out(spine, &spots, radius_mm);
     for view in &views {
-        let (x, y) = (view.middle.0 - view.half.0 + 6.0, view.middle.1 - view.half.1 + 16.0);
+        let (x, y) = (view.middle.0 - view.half.0 + 6.0, view.middle.1 - view.half.1 + 13.0);
         dots(svg, view, others.iter(), "#b9bfc6")?;
         text(svg, x, y, "class=\"halo\" fill=\"#57606a\"", view.title)?;
         tube(svg, view, spine, &spots, scale, radius_mm)?;
@@ -86,12 +88,24 @@ fn lay_out(spine: &Spine, spots: &[Spot], radius_mm: f64) -> ([View; 3], f64) {
     let ((x, w), (y, h), (z, d)) = (extent(&right), extent(&above), extent(&front));
     let centre = Point3::from(right * x + above * y + front * z);
     let scale = ((WIDTH - 4.0 * MARGIN) / (w + d)).min((MOST_HIGH - 4.0 * MARGIN) / (h + d));
+    // About half of the points face the eye: their dots are to cover the tube.
+    let area = 2.0 * radius_mm * spine.length_mm() * scale * scale;
+    let dot = (1.3 * (2.0 * area / spots.len().max(1) as f64).sqrt()).clamp(1.5, 4.0);
     let half = |a: f64, b: f64| (scale * a / 2.0 + MARGIN, scale * b / 2.0 + MARGIN);
     let (of_front, of_above, of_side) = (half(w, h), half(w, d), half(d, h));
     let slack = (WIDTH - 2.0 * (of_front.0 + of_side.0)) / 2.0;
     let middle_front = (slack + of_front.0, of_front.1);
-    let view =
-        |title, right, up, eye, middle, half| View { title, right, up, eye, centre, middle, half, scale };
+    let view = |title, right, up, eye, middle, half| View {
+        title,
+        right,
+        up,
+        eye,
+        centre,
+        middle,
+        half,
+        scale,
+        dot,
+    };
     let views = [
         view("from the front", right, above, front, middle_front, of_front),
         view("from above", right, -front, above, (middle_front.0, 2.0 * of_front.1 + of_above.1), of_above),
@@ -163,7 +177,7 @@ fn dots<'a>(
     if path.is_empty() {
         return Ok(());
     }
-    let style = "stroke-width=\"1.9\" stroke-linecap=\"round\" fill=\"none\"";
+    let style = format!("stroke-width=\"{:.1}\" stroke-linecap=\"round\" fill=\"none\"", view.dot);
     writeln!(svg, "<path d=\"{path}\" stroke=\"{colour}\" {style}/>")
 }
 
@@ -188,8 +202,9 @@ fn marks(svg: &mut String, view: &View, spine: &Spine, radius_mm: f64) -> Result
     let end = spine.frame_at(spine.length_mm());
     let start = spine.frame_at(0.0);
     let ends = [(start, -(start * Vector3::x()), "first end"), (end, end * Vector3::x(), "last end")];
-    for (frame, away, words) in ends {
-        let (x, y) = beside(view, &frame.translation.vector.into(), &away, 4.0);
+    // Where an end points at the eye or away from it, its name would lie on the tube.
+    for (frame, away, words) in ends.iter().filter(|e| e.1.dot(&view.eye).abs() < 0.9) {
+        let (x, y) = beside(view, &frame.translation.vector.into(), away, 4.0);
         text(
             svg,
             x,
