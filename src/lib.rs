@@ -6,8 +6,8 @@
 //!              └────────────── cell: one state machine drives it, journal records it ──────────┘
 //! ```
 //!
-//! `tube` is the vocabulary, `sim` stands in for the hardware, `trial` runs the whole chain against it, `cli`
-//! is the face. Rooms from `tube` to `correct` are pure. ARCHITECTURE.md is the map.
+//! `tube` is the vocabulary, `report` what a person judges a measurement by, `sim` stands in for the hardware, `trial`
+//! runs the whole chain against it, `cli` is the face. Rooms from `tube` to `correct` are pure. ARCHITECTURE.md is the map.
 
 pub mod arm;
 pub mod bender;
@@ -20,6 +20,7 @@ pub mod inspect;
 pub mod journal;
 pub mod recognize;
 pub mod reconstruct;
+pub mod report;
 pub mod sim;
 pub mod trial;
 pub mod tube;

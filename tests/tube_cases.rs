@@ -375,6 +375,15 @@ fn measured_tube_reversed_is_its_table_reversed() {
     assert_eq!(back.reversed(), measured);
 }
 
+/// A real scan that began within its first bend: the closest point once panicked.
+#[test]
+fn a_straight_slightly_below_zero_has_a_closest_point() {
+    let tube = lra(&[(-0.11, 0.0, 90.0, 30.0)], 40.0);
+    let spine = Spine::from_lra(&tube, Frame::identity());
+    let near = spine.closest(&Point3::new(-0.05, 1.0, 0.0));
+    assert!(near.distance_mm < 1.01, "{near:?}");
+}
+
 // ---- polygons that are none
 
 #[test]

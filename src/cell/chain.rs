@@ -7,23 +7,42 @@ use super::driver::Craft;
 use super::event::Decision;
 use super::machine::Part;
 use crate::arm::ScanFile;
-use crate::cloud::{Unit, read_scan};
+use crate::cloud::{PointCloud, Unit, read_scan};
 use crate::correct::{self, History, Knowledge, Limits, SetUp, step};
 use crate::inspect::inspect;
-use crate::reconstruct::{Options, reconstruct};
+use crate::reconstruct::{Options, Reconstruction, Stage, reconstruct_watched};
 use crate::tube::{MachineLimits, MeasuredTube, Nominal};
+
+/// A scan and what it says.
+#[derive(Debug, Clone)]
+pub struct MeasuredScan {
+    /// The points.
+    pub cloud: PointCloud,
+    /// The tube in them.
+    pub found: Reconstruction,
+}
 
 /// Reads and reconstructs a scan, in the nominal's direction of travel where one is given. The error is for the
 /// operator: it names the file, what is wrong with it and what to do.
 pub fn measure(path: &Path, unit: Unit, nominal: Option<&Nominal>) -> Result<MeasuredTube, String> {
+    measure_scan(path, unit, nominal, &mut |_| ()).map(|scan| scan.found.measured)
+}
+
+/// The same with all that was found, telling each stage after reading as it begins.
+pub fn measure_scan(
+    path: &Path,
+    unit: Unit,
+    nominal: Option<&Nominal>,
+    begins: &mut dyn FnMut(Stage),
+) -> Result<MeasuredScan, String> {
     let begin = Instant::now();
     let scan = read_scan(path, unit).map_err(|e| e.to_string())?;
-    let found = reconstruct(&scan.cloud, &Options { nominal });
-    let mut measured = found.map_err(|e| format!("{}: {e}", path.display()))?.measured;
-    measured.scan_sha256 = scan.sha256;
-    measured.elapsed_ms = (begin.elapsed().as_secs_f64() * 1e4).round() / 10.0;
-    measured.warnings.extend(scan.notes);
-    Ok(measured)
+    let found = reconstruct_watched(&scan.cloud, &Options { nominal }, begins);
+    let mut found = found.map_err(|e| format!("{}: {e}", path.display()))?;
+    found.measured.scan_sha256 = scan.sha256;
+    found.measured.elapsed_ms = (begin.elapsed().as_secs_f64() * 1e4).round() / 10.0;
+    found.measured.warnings.extend(scan.notes);
+    Ok(MeasuredScan { cloud: scan.cloud, found })
 }
 
 /// Measures and decides for one part on one machine.

@@ -18,7 +18,7 @@ mod places;
 mod setup;
 mod worker;
 
-pub use chain::{Chain, measure};
+pub use chain::{Chain, MeasuredScan, measure, measure_scan};
 pub use driver::{Command, Craft, Decided, Driver, Identity, Notice};
 pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 pub use intents::JournalledIntents;

@@ -1,10 +1,13 @@
-//! `benderd reconstruct`: one scan to LRA.
+//! `benderd reconstruct`: one scan to LRA, and to pictures of how well it fits.
 
 use std::path::PathBuf;
 
+use super::export::{self, Export};
+use super::progress::Progress;
 use super::{Outcome, ScanUnit, say};
-use crate::cell::measure;
+use crate::cell::measure_scan;
 use crate::config::{Materials, load_part};
+use crate::reconstruct::Stage;
 use crate::tube::MeasuredTube;
 
 /// Arguments of `benderd reconstruct`.
@@ -21,6 +24,9 @@ pub struct Args {
     /// Print one JSON object instead of the table.
     #[arg(long)]
     json: bool,
+    /// Also writes a file: .csv the spine, .ply the points coloured by deviation, .html the report; repeatable.
+    #[arg(long, value_name = "FILE")]
+    export: Vec<Export>,
 }
 
 /// Runs the subcommand.
@@ -29,13 +35,30 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         Some(path) => Some(load_part(path, &Materials::shipped()?)?),
         None => None,
     };
-    let measured = measure(&args.scan, args.unit.into(), nominal.as_ref()).map_err(anyhow::Error::msg)?;
-    if args.json {
-        say(&serde_json::to_string(&measured)?);
-    } else {
-        say(&table(&measured));
-    }
+    export::check(&args.export, &args.scan)?;
+    let progress = Progress::new(!args.json);
+    progress.stage("reading the scan");
+    let scan = measure_scan(&args.scan, args.unit.into(), nominal.as_ref(), &mut |s| progress.stage(name(s)));
+    let scan = scan.map_err(anyhow::Error::msg)?;
+    drop(progress);
+    // The measurement first: it is worth having whatever becomes of the exports.
+    let measured = &scan.found.measured;
+    say(&if args.json { serde_json::to_string(measured)? } else { table(measured) });
+    let progress = Progress::new(!args.json);
+    progress.stage("writing the exports");
+    let file = args.scan.display().to_string();
+    let part = nominal.as_ref().map(|n| n.name.as_str());
+    args.export.iter().try_for_each(|e| e.write(&file, part, &scan))?;
     Ok(Outcome::Done)
+}
+
+/// A stage for people.
+fn name(stage: Stage) -> &'static str {
+    match stage {
+        Stage::CentreLine => "finding the centre line",
+        Stage::Structure => "telling straights from bends",
+        Stage::Fit => "fitting all points",
+    }
 }
 
 /// The measured tube for people.

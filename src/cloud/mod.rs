@@ -29,4 +29,6 @@ pub use grid::Grid;
 pub use neighbours::Neighbours;
 pub use point_cloud::PointCloud;
 pub use unit::Unit;
-pub use write::{PlyForm, write_e57, write_ply, write_ply_as, write_scan, write_stl, write_xyz};
+pub use write::{
+    PlyForm, write_coloured_ply, write_e57, write_ply, write_ply_as, write_scan, write_stl, write_xyz,
+};

@@ -103,6 +103,29 @@ pub fn write_ply_as(path: &Path, cloud: &PointCloud, form: PlyForm) -> Result<()
     })
 }
 
+/// Writes a binary little-endian PLY with a colour per point (`red`, `green`, `blue`) and its deviation from a surface
+/// (`deviation_mm`), as viewers show them. Points without a colour or deviation, where these are fewer, are left out.
+pub fn write_coloured_ply(
+    path: &Path,
+    cloud: &PointCloud,
+    colours: &[[u8; 3]],
+    deviations_mm: &[f64],
+) -> Result<(), CloudError> {
+    let points = cloud.len().min(colours.len()).min(deviations_mm.len());
+    write(path, |out| {
+        write!(out, "ply\nformat binary_little_endian 1.0\ncomment millimetres\nelement vertex {points}\n")?;
+        ["x", "y", "z"].iter().try_for_each(|axis| writeln!(out, "property double {axis}"))?;
+        ["red", "green", "blue"].iter().try_for_each(|name| writeln!(out, "property uchar {name}"))?;
+        out.write_all(b"property float deviation_mm\nend_header\n")?;
+        for ((p, colour), deviation) in cloud.iter().zip(colours).zip(deviations_mm) {
+            p.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            out.write_all(colour)?;
+            out.write_all(&(*deviation as f32).to_le_bytes())?;
+        }
+        Ok(())
+    })
+}
+
 /// Writes a text file, a point per line to the nanometre.
 pub fn write_xyz(path: &Path, cloud: &PointCloud) -> Result<(), CloudError> {
     write_text(path, "", ' ', cloud)

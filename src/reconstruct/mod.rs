@@ -71,8 +71,29 @@ const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 /// Share of the points that must lie on the tube.
 const LEAST_USED_SHARE: f64 = 0.5;
 
+/// What [`reconstruct_watched`] begins, for those who wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// What of the scan is the tube, and its centre line.
+    CentreLine,
+    /// Number and kind of the bends.
+    Structure,
+    /// Least squares on all points, ends, sigmas.
+    Fit,
+}
+
 /// Reconstructs the tube that the cloud shows.
 pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstruction, ReconstructError> {
+    reconstruct_watched(cloud, options, &mut |_| ())
+}
+
+/// The same, telling each stage as it begins.
+pub fn reconstruct_watched(
+    cloud: &PointCloud,
+    options: &Options,
+    begins: &mut dyn FnMut(Stage),
+) -> Result<Reconstruction, ReconstructError> {
+    begins(Stage::CentreLine);
     let scene = scene::look(cloud, options.nominal)?;
     let (radius_mm, polygon) = (scene.radius_mm, scene.polygon);
     let own: Vec<Point3<f64>> = match &scene.own {
@@ -86,11 +107,13 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         radius_mm,
         most: structure::MOST_BENDS,
     };
+    begins(Stage::Structure);
     let chosen = structure::choose(&polygon, &sample, radius_mm).ok_or_else(not_bent)?;
     let model = chosen.model;
     if moves::is_free_form(&model.lra, radius_mm) {
         return Err(not_bent());
     }
+    begins(Stage::Fit);
     let mut all = Sample::new(own, &model);
     let mut best = fit(
         &mut all,

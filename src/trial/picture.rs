@@ -1,5 +1,5 @@
 //! A trial as one SVG: the tube with its deviations drawn larger, angle deviation per bend and envelope, part by
-//! part. Own writer: three panels of lines, circles and text need no library.
+//! part, out of `report`'s lines and text.
 
 use std::fmt::Write;
 
@@ -7,6 +7,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::record::PartRecord;
 use crate::inspect::Verdict;
+use crate::report::svg::{line, polyline, round_step, text};
 use crate::tube::align::{Pair, register};
 use crate::tube::{Frame, Lra, Nominal, Spine};
 
@@ -71,23 +72,8 @@ fn draw_into(
     writeln!(svg, "</svg>")
 }
 
-fn text(svg: &mut String, x: f64, y: f64, attributes: &str, words: &str) -> std::fmt::Result {
-    let words = words.replace('&', "&amp;").replace('<', "&lt;");
-    writeln!(svg, "<text x=\"{x:.1}\" y=\"{y:.1}\" {attributes}>{words}</text>")
-}
-
 fn heading(svg: &mut String, x: f64, words: &str) -> std::fmt::Result {
     text(svg, x, TOP - 16.0, "font-weight=\"600\"", words)
-}
-
-fn line(svg: &mut String, from: (f64, f64), to: (f64, f64), attributes: &str) -> std::fmt::Result {
-    let ((x1, y1), (x2, y2)) = (from, to);
-    writeln!(svg, "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" {attributes}/>")
-}
-
-fn polyline(svg: &mut String, points: &[(f64, f64)], attributes: &str) -> std::fmt::Result {
-    let list: Vec<String> = points.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
-    writeln!(svg, "<polyline points=\"{}\" fill=\"none\" {attributes}/>", list.join(" "))
 }
 
 fn columns(svg: &mut String, panel: &Panel) -> std::fmt::Result {
@@ -100,8 +86,7 @@ fn columns(svg: &mut String, panel: &Panel) -> std::fmt::Result {
 
 /// Grid lines at round values with their labels.
 fn grid(svg: &mut String, panel: &Panel, unit: &str, signed: bool) -> std::fmt::Result {
-    let step = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0];
-    let step = step.into_iter().find(|s| (panel.high - panel.low) / s <= 7.0).unwrap_or(200.0);
+    let step = round_step(panel.high - panel.low, 7.0).max(0.1);
     let first = (panel.low / step).ceil() as i64;
     let last = (panel.high / step).floor() as i64;
     for k in first..=last {

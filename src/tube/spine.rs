@@ -91,7 +91,8 @@ impl Segment {
     pub fn closest_along_mm(&self, point: &Point3<f64>) -> f64 {
         let local = self.start.inverse_transform_point(point);
         match self.kind {
-            SegmentKind::Line => local.x.clamp(0.0, self.length_mm),
+            // A scan that begins within a bend can leave the straight before it a length a little below 0.
+            SegmentKind::Line => local.x.clamp(0.0, self.length_mm.max(0.0)),
             SegmentKind::Arc { radius_mm, angle_rad } => {
                 let turn = local.x.atan2(radius_mm - local.y).rem_euclid(2.0 * PI);
                 if turn <= angle_rad {
