@@ -16,6 +16,7 @@ mod error;
 mod evidence;
 mod face;
 pub mod fit;
+mod guided;
 mod local;
 mod measure;
 pub mod mls;
@@ -26,6 +27,7 @@ mod moves;
 mod normal;
 mod outline;
 pub mod owner;
+mod places;
 pub mod radius;
 pub mod scene;
 mod sections;
@@ -85,7 +87,11 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         radius_mm,
         most: structure::MOST_BENDS,
     };
-    let chosen = structure::choose(&polygon, &sample, radius_mm).ok_or_else(not_bent)?;
+    let chosen = match options.nominal {
+        Some(nominal) => guided::choose(&polygon, &sample, radius_mm, nominal),
+        None => structure::choose(&polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
+    };
+    let (chosen, notes) = chosen.ok_or_else(not_bent)?;
     let model = chosen.model;
     if moves::is_free_form(&model.lra, radius_mm) {
         return Err(not_bent());
@@ -112,7 +118,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         own_residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
     measured.points_total = cloud.len();
-    measured.warnings.splice(0..0, scene.warnings);
+    measured.warnings.splice(0..0, scene.warnings.into_iter().chain(notes));
     // The points of the surroundings have a distance from the tube too.
     let residuals_mm = match scene.own {
         Some(_) => Sample::new(cloud.iter().collect(), &best.model).residuals(&best.model),
