@@ -12,12 +12,13 @@ use nalgebra::Point3;
 
 use super::evidence::Solved;
 use super::fit::{RadiusPrior, Way, descend};
+use super::likeness::{is_formed, rows};
 use super::model::{Parameter, TubeModel};
 use super::moves::with_common_radius;
 use super::places::{Course, SHALLOW_RAD, lay};
 use super::sections::CentreLine;
 use super::structure::{self, Structure};
-use crate::tube::{Lra, Nominal, wrap_angle};
+use crate::tube::{Lra, Nominal};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
@@ -40,13 +41,7 @@ const JOINT_GAIN: f64 = 30.0;
 /// Sections that scatter this much more than their points say are not the tube's.
 const MOST_CORRELATION: f64 = 25.0;
 
-/// What forming may change: angle (at least, and as a share), rotation, length (at least, and in tube radii), beside some
-/// sigmas.
-const FORMED_ANGLE_RAD: f64 = 9.5 * DEGREE;
-const FORMED_ANGLE_SHARE: f64 = 0.11;
-const FORMED_ROTATION_RAD: f64 = 12.0 * DEGREE;
-const FORMED_LENGTH_MM: f64 = 5.0;
-const FORMED_LENGTH_RADII: f64 = 1.0;
+/// Answers that differ by fewer of these are the same.
 const SIGMAS: f64 = 4.0;
 
 /// An angle less certain than this is not measured by the nominal's structure; the free search is asked.
@@ -70,7 +65,7 @@ pub fn choose(
     let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
         return free().map(|s| (s, Vec::new()));
     };
-    if guided.doubts(polygon).is_empty() {
+    if guided.is_sure(polygon) {
         let notes = guided.resting();
         return Some((guided.structure(), notes));
     }
@@ -202,48 +197,35 @@ impl Guided {
 
     /// Whether forming may have made this of the nominal.
     fn is_formed_of_the_nominal(&self) -> bool {
-        let radius = self.best.model.tube_radius_mm;
-        let bends = &self.best.model.lra.bends;
-        let within = |off: f64, usual: f64, p: Parameter| match self.sigma(p) {
-            Some(sigma) => off.abs() <= usual + SIGMAS * sigma,
-            None => true,
-        };
-        bends.iter().zip(&self.part.bends).enumerate().all(|(i, (b, p))| {
-            // A small turn's plane may swing.
-            let known = b.angle_rad.min(p.angle_rad).min(1.0);
-            let before = if i > 0 {
-                bends[i - 1].angle_rad.min(self.part.bends[i - 1].angle_rad).min(1.0)
-            } else {
-                1.0
-            };
-            let rotation = FORMED_ROTATION_RAD / known.min(before).max(0.05);
-            let length = FORMED_LENGTH_MM.max(FORMED_LENGTH_RADII * radius)
-                + FORMED_ANGLE_RAD
-                    * (p.radius_mm + if i > 0 { self.part.bends[i - 1].radius_mm } else { 0.0 });
-            let angle = FORMED_ANGLE_RAD.max(FORMED_ANGLE_SHARE * p.angle_rad);
-            within(b.angle_rad - p.angle_rad, angle, Parameter::Angle(i))
-                && within(wrap_angle(b.rotation_rad - p.rotation_rad), rotation, Parameter::Rotation(i))
-                && within(b.length_mm - p.length_mm, length, Parameter::Length(i))
-        })
+        let mut found = rows(&self.best.model.lra);
+        let unknown = f64::INFINITY;
+        for (i, row) in found.iter_mut().enumerate() {
+            row.angle_sigma_rad = self.angle_sigma_rad(i);
+            row.length_sigma_mm = self.sigma(Parameter::Length(i)).unwrap_or(unknown);
+            row.rotation_sigma_rad = self.sigma(Parameter::Rotation(i)).unwrap_or(unknown);
+        }
+        is_formed(&found, &rows(&self.part), self.best.model.tube_radius_mm)
     }
 
-    /// What speaks for asking the free search.
-    fn doubts(&self, polygon: &[Point3<f64>]) -> Vec<&'static str> {
-        let joints = || {
-            let joints =
-                self.solved.joints(&self.line, &self.best.model, &self.best.parameters, self.line.noise_mm);
-            joints.iter().any(|j| j.gain > JOINT_GAIN * self.correlation)
-        };
-        let unsure = (0..self.part.bends.len()).any(|i| self.angle_sigma_rad(i) > MAX_ANGLE_SIGMA_RAD);
-        let mut out = Vec::new();
-        out.extend((self.correlation > MOST_CORRELATION).then_some("misfit"));
-        out.extend(unsure.then_some("angle not determined"));
-        out.extend((!self.is_formed_of_the_nominal()).then_some("not as formed"));
-        out.extend((!self.explains(polygon)).then_some("centre line elsewhere"));
-        if out.is_empty() {
-            out.extend(joints().then_some("joint"));
-        }
-        out
+    /// Whether nothing speaks for asking the free search.
+    fn is_sure(&self, polygon: &[Point3<f64>]) -> bool {
+        self.correlation <= MOST_CORRELATION
+            && self.is_determined()
+            && self.is_formed_of_the_nominal()
+            && self.explains(polygon)
+            && !self.lacks_a_joint()
+    }
+
+    /// Whether every angle is measured.
+    fn is_determined(&self) -> bool {
+        (0..self.part.bends.len()).all(|i| self.angle_sigma_rad(i) <= MAX_ANGLE_SIGMA_RAD)
+    }
+
+    /// Whether the free search would try a bend somewhere.
+    fn lacks_a_joint(&self) -> bool {
+        let joints =
+            self.solved.joints(&self.line, &self.best.model, &self.best.parameters, self.line.noise_mm);
+        joints.iter().any(|j| j.gain > JOINT_GAIN * self.correlation)
     }
 
     /// Bends that the free search would not spend their values on.
@@ -274,7 +256,7 @@ impl Guided {
         let mine = fitted(&line, self.best.model.clone(), self.prior, correlation, FULL_STEPS);
         let other = fitted(&line, own.model.clone(), own.prior, correlation, 0);
         let bends = other.model.lra.bends.len();
-        let sure = (0..n).all(|i| self.angle_sigma_rad(i) <= MAX_ANGLE_SIGMA_RAD);
+        let sure = self.is_determined();
         let formed = self.is_formed_of_the_nominal();
         // More bends that explain no less and are the nominal's: the free search only spared itself the shallow ones.
         let spared = bends < n && formed && mine.misfit <= other.misfit;
@@ -283,7 +265,8 @@ impl Guided {
         }
         let groups = self.groups(&other.model);
         if bends == n && groups.is_empty() {
-            return (self.structure(), self.resting());
+            let guided = if sure { self.structure() } else { own };
+            return (guided, self.resting());
         }
         let what = if bends == 1 { "bend" } else { "bends" };
         let list = if groups.is_empty() { String::new() } else { format!("; {}", groups.join("; ")) };

@@ -17,6 +17,7 @@ mod evidence;
 mod face;
 pub mod fit;
 mod guided;
+mod likeness;
 mod local;
 mod measure;
 pub mod mls;
@@ -74,6 +75,22 @@ const LEAST_USED_SHARE: f64 = 0.5;
 
 /// Reconstructs the tube that the cloud shows.
 pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstruction, ReconstructError> {
+    use ReconstructError::{NotBent, PoorFit, Undetermined};
+    match by(cloud, options, options.nominal) {
+        // Knowing the nominal never makes it worse.
+        Err(NotBent { .. } | PoorFit { .. } | Undetermined { .. }) if options.nominal.is_some() => {
+            by(cloud, options, None)
+        }
+        found => found,
+    }
+}
+
+/// Reconstructs with the structure by `guide`, or freely.
+fn by(
+    cloud: &PointCloud,
+    options: &Options,
+    guide: Option<&Nominal>,
+) -> Result<Reconstruction, ReconstructError> {
     let scene = scene::look(cloud, options.nominal)?;
     let (radius_mm, polygon) = (scene.radius_mm, scene.polygon);
     let own: Vec<Point3<f64>> = match &scene.own {
@@ -87,7 +104,7 @@ pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstructi
         radius_mm,
         most: structure::MOST_BENDS,
     };
-    let chosen = match options.nominal {
+    let chosen = match guide {
         Some(nominal) => guided::choose(&polygon, &sample, radius_mm, nominal),
         None => structure::choose(&polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
     };
