@@ -14,7 +14,7 @@ use super::evidence::Solved;
 use super::fit::{RadiusPrior, Way, descend};
 use super::likeness::{is_formed, rows};
 use super::model::{Parameter, TubeModel};
-use super::moves::with_common_radius;
+use super::moves::{with_common_radius, without_bend};
 use super::places::{Course, SHALLOW_RAD, lay};
 use super::sections::CentreLine;
 use super::structure::{self, Structure};
@@ -43,6 +43,9 @@ const MOST_CORRELATION: f64 = 25.0;
 
 /// Answers that differ by fewer of these are the same.
 const SIGMAS: f64 = 4.0;
+
+/// A bend whose angle is this many times less certain than its values cost is tried without, as the free search does.
+const DOUBT: f64 = 4.0;
 
 /// An angle less certain than this is not measured by the nominal's structure; the free search is asked.
 const MAX_ANGLE_SIGMA_RAD: f64 = 5.0 * DEGREE;
@@ -80,9 +83,8 @@ pub fn choose(
 struct Fitted {
     model: TubeModel,
     parameters: Vec<Parameter>,
-    /// Squared residuals over the noise's variance, per independent point.
-    misfit: f64,
-    /// Misfit and what the values cost (as in `structure`): smaller is better.
+    /// Squared residuals over the noise's variance, per independent point, and what the values cost (as in `structure`):
+    /// smaller is better.
     score: f64,
 }
 
@@ -115,7 +117,12 @@ fn fitted(
     let descent = descend(&mut line.clone(), model, &parameters, prior, way);
     let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / correlation;
     let score = misfit + parameters.len() as f64 * (line.count / correlation).max(2.0).ln();
-    Fitted { model: descent.model, parameters, misfit, score }
+    Fitted { model: descent.model, parameters, score }
+}
+
+/// What the five values of one bend more cost.
+fn bend_price(line: &CentreLine, correlation: f64) -> f64 {
+    5.0 * (line.count / correlation).max(2.0).ln()
 }
 
 /// What bend radii the nominal lets expect.
@@ -230,11 +237,16 @@ impl Guided {
 
     /// Bends that the free search would not spend their values on.
     fn resting(&self) -> Vec<String> {
-        let price = 5.0 * (self.line.count / self.correlation).max(2.0).ln();
+        let worth_a_look = DOUBT * bend_price(&self.line, self.correlation);
         let mut out: Vec<(usize, String)> = Vec::new();
         for (i, bend) in self.best.model.lra.bends.iter().enumerate() {
             let sigma = self.angle_sigma_rad(i);
-            if bend.angle_rad < SHALLOW_RAD && (bend.angle_rad / sigma).powi(2) < price {
+            if bend.angle_rad < SHALLOW_RAD && (bend.angle_rad / sigma).powi(2) < worth_a_look {
+                let less = without_bend(&self.best.model, i);
+                let less = fitted(&self.line, less, self.prior, self.correlation, FULL_STEPS);
+                if less.score >= self.best.score {
+                    continue;
+                }
                 let number = self.number(i);
                 let text = format!(
                     "bend {number} rests on the nominal: {:.2} +- {:.2} degrees are too few for the scan to show it by itself",
@@ -258,8 +270,9 @@ impl Guided {
         let bends = other.model.lra.bends.len();
         let sure = self.is_determined();
         let formed = self.is_formed_of_the_nominal();
-        // More bends that explain no less and are the nominal's: the free search only spared itself the shallow ones.
-        let spared = bends < n && formed && mine.misfit <= other.misfit;
+        // The nominal's, but for what its further bends cost no worse: the free search spared itself the shallow ones.
+        let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
+        let spared = formed && mine.score - saved <= other.score;
         if sure && (mine.score <= other.score || spared) {
             return (self.structure(), self.resting());
         }

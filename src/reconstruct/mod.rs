@@ -47,7 +47,8 @@ use sections::CentreLine;
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Options<'a> {
-    /// The part that the scan should show: its direction of travel becomes the measurement's.
+    /// The part that the scan should show: the fit starts from its bends (see `guided`), and its direction of travel
+    /// becomes the measurement's.
     pub nominal: Option<&'a Nominal>,
 }
 
