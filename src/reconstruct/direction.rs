@@ -3,38 +3,58 @@
 use nalgebra::{Point3, Vector3};
 
 use super::Reconstruction;
+use super::likeness::{self, measured_rows, rows, unlikeness};
 use crate::tube::align::{Pair, register};
 use crate::tube::{Frame, Nominal, Spine};
 
 /// Places along the tube that are compared.
 const PLACES: usize = 100;
 
+/// A difference in unlikeness that decides nothing.
+const UNDECIDED: f64 = 0.5;
+
 /// The reconstruction in the direction in which it lies closer to the nominal.
 pub fn as_nominal(found: Reconstruction, nominal: &Nominal) -> Reconstruction {
-    let wanted = places(&Spine::from_lra(&nominal.lra, Frame::identity()));
-    let as_is = places(&found.spine);
-    let turned: Vec<Point3<f64>> = as_is.iter().rev().copied().collect();
-    let reversed = distance(&turned, &wanted) < distance(&as_is, &wanted);
+    let reversed = is_against(&found, nominal);
     let mut out = if reversed { turn_round(found) } else { found };
     out.measured.reversed = Some(reversed);
     out.measured.warnings.extend(doubts(&out, nominal));
     out
 }
 
+/// Whether the tube lies closer to the nominal when it is travelled the other way: bend by bend where it has as many,
+/// so that a missing end piece does not matter; otherwise place by place.
+fn is_against(found: &Reconstruction, nominal: &Nominal) -> bool {
+    let part = nominal.lra.merged();
+    if found.lra.bends.len() == part.bends.len() && !part.bends.is_empty() {
+        let wanted = rows(&part);
+        let radius_mm = found.measured.tube_radius_mm;
+        let as_is = unlikeness(&measured_rows(&found.measured, &found.lra), &wanted, radius_mm);
+        let turned = measured_rows(&found.measured.reversed(), &found.lra.reversed());
+        let turned = unlikeness(&turned, &wanted, radius_mm);
+        // Alike from both ends, the end straights decide.
+        if (as_is - turned).abs() > UNDECIDED {
+            return turned < as_is;
+        }
+    }
+    let wanted = places(&Spine::from_lra(&part, Frame::identity()));
+    let as_is = places(&found.spine);
+    let turned: Vec<Point3<f64>> = as_is.iter().rev().copied().collect();
+    distance(&turned, &wanted) < distance(&as_is, &wanted)
+}
+
 /// What speaks against this being the nominal's tube at all.
 fn doubts(found: &Reconstruction, nominal: &Nominal) -> Vec<String> {
-    let mut doubts = Vec::new();
-    let (bends, wanted) = (found.measured.bends.len(), nominal.lra.merged().bends.len());
-    if bends != wanted {
-        doubts.push(format!("{bends} bends found, the nominal has {wanted}: is this the part?"));
-    }
     let (radius, wanted) = (found.measured.tube_radius_mm, nominal.od_mm / 2.0);
+    let mut out = Vec::new();
     if nominal.is_other_tube(radius) {
-        doubts.push(format!(
+        out.push(format!(
             "tube radius {radius:.2} mm, the nominal's is {wanted} mm: is this the part, in this unit?"
         ));
     }
-    doubts
+    let rows = measured_rows(&found.measured, &found.lra);
+    out.extend(likeness::doubts(&rows, &nominal.lra.merged(), radius));
+    out
 }
 
 fn places(spine: &Spine) -> Vec<Point3<f64>> {

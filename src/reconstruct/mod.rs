@@ -16,6 +16,8 @@ mod error;
 mod evidence;
 mod face;
 pub mod fit;
+mod guided;
+mod likeness;
 mod local;
 mod measure;
 pub mod mls;
@@ -26,6 +28,7 @@ mod moves;
 mod normal;
 mod outline;
 pub mod owner;
+mod places;
 mod profile;
 pub mod radius;
 pub mod scene;
@@ -45,7 +48,8 @@ use sections::CentreLine;
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Options<'a> {
-    /// The part that the scan should show: its direction of travel becomes the measurement's.
+    /// The part that the scan should show: the fit starts from its bends (see `guided`), and its direction of travel
+    /// becomes the measurement's.
     pub nominal: Option<&'a Nominal>,
 }
 
@@ -93,6 +97,23 @@ pub fn reconstruct_watched(
     options: &Options,
     begins: &mut dyn FnMut(Stage),
 ) -> Result<Reconstruction, ReconstructError> {
+    use ReconstructError::{NotBent, PoorFit, Undetermined};
+    match by(cloud, options, options.nominal, begins) {
+        // Knowing the nominal never makes it worse.
+        Err(NotBent { .. } | PoorFit { .. } | Undetermined { .. }) if options.nominal.is_some() => {
+            by(cloud, options, None, begins)
+        }
+        found => found,
+    }
+}
+
+/// Reconstructs with the structure by `guide`, or freely.
+fn by(
+    cloud: &PointCloud,
+    options: &Options,
+    guide: Option<&Nominal>,
+    begins: &mut dyn FnMut(Stage),
+) -> Result<Reconstruction, ReconstructError> {
     begins(Stage::CentreLine);
     let scene = scene::look(cloud, options.nominal)?;
     let (radius_mm, polygon) = (scene.radius_mm, scene.polygon);
@@ -108,7 +129,11 @@ pub fn reconstruct_watched(
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
-    let chosen = structure::choose(&polygon, &sample, radius_mm).ok_or_else(not_bent)?;
+    let chosen = match guide {
+        Some(nominal) => guided::choose(&polygon, &sample, radius_mm, nominal),
+        None => structure::choose(&polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
+    };
+    let (chosen, notes) = chosen.ok_or_else(not_bent)?;
     let model = chosen.model;
     if moves::is_free_form(&model.lra, radius_mm) {
         return Err(not_bent());
@@ -138,7 +163,7 @@ pub fn reconstruct_watched(
     measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
     measured.decisions = chosen.decisions;
     measured.points_total = cloud.len();
-    measured.warnings.splice(0..0, scene.warnings);
+    measured.warnings.splice(0..0, scene.warnings.into_iter().chain(notes));
     // The points of the surroundings have a distance from the tube too.
     let residuals_mm = match scene.own {
         Some(_) => Sample::new(cloud.iter().collect(), &best.model).residuals(&best.model),

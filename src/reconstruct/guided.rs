@@ -1,0 +1,329 @@
+//! The structure by the nominal: its table laid onto the spine ([`places`](super::places)) in both directions, fitted to
+//! the measured centre line, and doubted. Beside [`structure`], the free search, which is the check on it.
+//!
+//! Safety: a wrong part must never look like a good measurement of the right one. So the nominal's structure is returned
+//! only (1) when the fit raises no doubt: all of the centre line lies on it, no joint anywhere would explain the sections
+//! better (the free search's own test), and every angle, rotation and length is what forming may have made of the
+//! nominal's; or (2) in doubt, when the free search finds nothing that explains the sections better. Where the free
+//! search explains them better, its answer is returned, with both in figures. Bends too shallow for the free search are
+//! kept: they cost it more than they explain, which is no evidence against them.
+
+use nalgebra::Point3;
+
+use super::evidence::Solved;
+use super::fit::{RadiusPrior, Way, descend};
+use super::likeness::{is_formed, rows};
+use super::model::{Parameter, TubeModel};
+use super::moves::{with_common_radius, without_bend};
+use super::places::{Course, SHALLOW_RAD, lay};
+use super::profile::lengths;
+use super::sections::CentreLine;
+use super::structure::{self, Structure};
+use crate::tube::{Lra, Nominal};
+
+const DEGREE: f64 = std::f64::consts::PI / 180.0;
+
+/// Steps of the fits to the polygon and to the sections, and how often the sections are measured.
+const ROUGH_STEPS: usize = 20;
+const FULL_STEPS: usize = 40;
+const MEASUREMENTS: usize = 2;
+
+/// Bend radii are expected within this share of each other, or as far as the nominal's differ.
+const RADIUS_SPREAD: f64 = 0.3;
+
+/// A vertex of the spine's polygon this far from the fitted centre line is not explained by it, in tube radii; and how
+/// many in a row may be so.
+const OFF_RADII: f64 = 0.25;
+const MOST_OFF: usize = 3;
+
+/// Gain of a joint, per independent point, that raises doubt: the free search would try a bend there.
+const JOINT_GAIN: f64 = 30.0;
+
+/// Sections that scatter this much more than their points say are not the tube's.
+const MOST_CORRELATION: f64 = 25.0;
+
+/// Answers that differ by fewer of these are the same.
+const SIGMAS: f64 = 4.0;
+
+/// A bend whose angle is this many times less certain than its values cost is tried without, as the free search does.
+const DOUBT: f64 = 4.0;
+
+/// An angle less certain than this is not measured by the nominal's structure; the free search is asked.
+const MAX_ANGLE_SIGMA_RAD: f64 = 5.0 * DEGREE;
+
+/// Two answers that differ by less than this and the sigmas are the same.
+const SAME_ANGLE_RAD: f64 = 0.05 * DEGREE;
+
+/// A structure and what the user should know of the choice, bends counted as the nominal counts them.
+pub type Chosen = (Structure, Vec<String>);
+
+/// Finds the structure by the nominal, or freely where that explains the scan better. None when neither does.
+pub fn choose(
+    polygon: &[Point3<f64>],
+    sample: &[Point3<f64>],
+    radius_mm: f64,
+    nominal: &Nominal,
+) -> Option<Chosen> {
+    let free = || structure::choose(polygon, sample, radius_mm);
+    let part = nominal.lra.merged();
+    let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
+        return free().map(|s| (s, Vec::new()));
+    };
+    if guided.is_sure(polygon) {
+        let notes = guided.resting();
+        return Some((guided.structure(), notes));
+    }
+    match free() {
+        Some(own) => Some(guided.or_own(own, sample)),
+        None => guided.explains(polygon).then(|| (guided.structure(), Vec::new())),
+    }
+}
+
+/// A fit to the sections.
+#[derive(Debug, Clone)]
+struct Fitted {
+    model: TubeModel,
+    parameters: Vec<Parameter>,
+    /// Squared residuals over the noise's variance, per independent point, and what the values cost (as in `structure`):
+    /// smaller is better.
+    score: f64,
+}
+
+/// The nominal's structure as the scan shows it.
+struct Guided {
+    best: Fitted,
+    line: CentreLine,
+    correlation: f64,
+    prior: Option<RadiusPrior>,
+    /// The nominal in the polygon's direction.
+    part: Lra,
+    /// Whether that is against its own.
+    reversed: bool,
+    /// Standard deviation per parameter.
+    sigmas: Vec<f64>,
+    solved: Solved,
+}
+
+/// Fits a model to the sections, or judges it as it is with no steps.
+fn fitted(
+    line: &CentreLine,
+    model: TubeModel,
+    prior: Option<RadiusPrior>,
+    correlation: f64,
+    steps: usize,
+) -> Fitted {
+    let parameters = model.parameters();
+    let noise_mm = line.noise_mm;
+    let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: f64::INFINITY };
+    let descent = descend(&mut line.clone(), model, &parameters, prior, way);
+    let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / correlation;
+    let score = misfit + parameters.len() as f64 * (line.count / correlation).max(2.0).ln();
+    Fitted { model: descent.model, parameters, score }
+}
+
+/// What the five values of one bend more cost.
+fn bend_price(line: &CentreLine, correlation: f64) -> f64 {
+    5.0 * (line.count / correlation).max(2.0).ln()
+}
+
+/// What bend radii the nominal lets expect.
+fn expected_radii(part: &Lra) -> Option<RadiusPrior> {
+    let weight: f64 = part.bends.iter().map(|b| b.angle_rad).sum();
+    let mean = part.bends.iter().map(|b| b.angle_rad * b.radius_mm).sum::<f64>() / weight;
+    let most = part.bends.iter().map(|b| (b.radius_mm - mean).abs()).fold(RADIUS_SPREAD * mean, f64::max);
+    (weight > 0.0).then_some(RadiusPrior { radius_mm: mean, spread_mm: most })
+}
+
+fn has_common_radius(part: &Lra) -> bool {
+    part.bends.windows(2).all(|w| (w[0].radius_mm - w[1].radius_mm).abs() < 1e-6)
+}
+
+impl Guided {
+    /// The nominal laid and fitted in the better of both directions; None where it cannot lie.
+    fn fit(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64, part: &Lra) -> Option<Guided> {
+        let course = Course::new(polygon, radius_mm).filter(|_| !part.bends.is_empty())?;
+        let prior = expected_radii(part);
+        let rough = CentreLine::of_polygon(polygon, radius_mm);
+        let laid =
+            [(part.clone(), false), (part.reversed(), true)].into_iter().filter_map(|(part, reversed)| {
+                let start = lay(&course, &part)?;
+                Some((fitted(&rough, start, prior, 1.0, ROUGH_STEPS), part, reversed))
+            });
+        let (mut best, part, reversed) = laid.min_by(|a, b| a.0.score.total_cmp(&b.0.score))?;
+        let mut line = rough;
+        for round in 0..MEASUREMENTS {
+            line = CentreLine::measure(sample, &best.model, round > 0);
+            best = fitted(&line, best.model, prior, 1.0, FULL_STEPS);
+        }
+        let correlation = line.correlation(&best.model);
+        best = fitted(&line, best.model, prior, correlation, 0);
+        if has_common_radius(&part) && part.bends.len() > 1 {
+            let common = fitted(&line, with_common_radius(&best.model), prior, correlation, FULL_STEPS);
+            best = if common.score < best.score { common } else { best };
+        }
+        let solved = Solved::new(&line, &best.model, &best.parameters);
+        let variance = line.noise_mm.powi(2) * correlation;
+        let sigmas = solved.inverse.diagonal().iter().map(|v| (v * variance).max(0.0).sqrt()).collect();
+        Some(Guided { best, line, correlation, prior, part, reversed, sigmas, solved })
+    }
+
+    fn structure(&self) -> Structure {
+        let (model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
+        let held = lengths(&self.line, &model, self.correlation, self.prior);
+        Structure { model, noise_mm, prior: self.prior, held, decisions: Vec::new() }
+    }
+
+    fn sigma(&self, parameter: Parameter) -> Option<f64> {
+        let at = self.best.parameters.iter().position(|p| *p == parameter)?;
+        Some(self.sigmas[at])
+    }
+
+    fn angle_sigma_rad(&self, bend: usize) -> f64 {
+        self.sigma(Parameter::Angle(bend)).unwrap_or(f64::INFINITY)
+    }
+
+    /// The nominal's count of a bend, from 1.
+    fn number(&self, bend: usize) -> usize {
+        if self.reversed { self.part.bends.len() - bend } else { bend + 1 }
+    }
+
+    /// Whether all of the spine's polygon lies on the fitted centre line.
+    fn explains(&self, polygon: &[Point3<f64>]) -> bool {
+        // The ends' lengths are not fitted.
+        let mut model = self.best.model.clone();
+        let beyond = 10.0 * model.tube_radius_mm;
+        model.start *= nalgebra::Translation3::new(-beyond, 0.0, 0.0);
+        model.lra.bends.iter_mut().take(1).for_each(|b| b.length_mm += beyond);
+        model.lra.last_length_mm += beyond;
+        let spine = model.spine();
+        let mut run = 0;
+        polygon.iter().all(|p| {
+            let off = spine.closest(p).distance_mm > OFF_RADII * model.tube_radius_mm;
+            run = if off { run + 1 } else { 0 };
+            run <= MOST_OFF
+        })
+    }
+
+    /// Whether forming may have made this of the nominal.
+    fn is_formed_of_the_nominal(&self) -> bool {
+        let mut found = rows(&self.best.model.lra);
+        let unknown = f64::INFINITY;
+        for (i, row) in found.iter_mut().enumerate() {
+            row.angle_sigma_rad = self.angle_sigma_rad(i);
+            row.length_sigma_mm = self.sigma(Parameter::Length(i)).unwrap_or(unknown);
+            row.rotation_sigma_rad = self.sigma(Parameter::Rotation(i)).unwrap_or(unknown);
+        }
+        is_formed(&found, &rows(&self.part), self.best.model.tube_radius_mm)
+    }
+
+    /// Whether nothing speaks for asking the free search.
+    fn is_sure(&self, polygon: &[Point3<f64>]) -> bool {
+        self.correlation <= MOST_CORRELATION
+            && self.is_determined()
+            && self.is_formed_of_the_nominal()
+            && self.explains(polygon)
+            && !self.lacks_a_joint()
+    }
+
+    /// Whether every angle is measured.
+    fn is_determined(&self) -> bool {
+        (0..self.part.bends.len()).all(|i| self.angle_sigma_rad(i) <= MAX_ANGLE_SIGMA_RAD)
+    }
+
+    /// Whether the free search would try a bend somewhere.
+    fn lacks_a_joint(&self) -> bool {
+        let joints =
+            self.solved.joints(&self.line, &self.best.model, &self.best.parameters, self.line.noise_mm);
+        joints.iter().any(|j| j.gain > JOINT_GAIN * self.correlation)
+    }
+
+    /// Bends that the free search would not spend their values on.
+    fn resting(&self) -> Vec<String> {
+        let worth_a_look = DOUBT * bend_price(&self.line, self.correlation);
+        let mut out: Vec<(usize, String)> = Vec::new();
+        for (i, bend) in self.best.model.lra.bends.iter().enumerate() {
+            let sigma = self.angle_sigma_rad(i);
+            if bend.angle_rad < SHALLOW_RAD && (bend.angle_rad / sigma).powi(2) < worth_a_look {
+                let less = without_bend(&self.best.model, i);
+                let less = fitted(&self.line, less, self.prior, self.correlation, FULL_STEPS);
+                if less.score >= self.best.score {
+                    continue;
+                }
+                let number = self.number(i);
+                let text = format!(
+                    "bend {number} rests on the nominal: {:.2} +- {:.2} degrees are too few for the scan to show it by itself",
+                    bend.angle_rad.to_degrees(),
+                    sigma.to_degrees()
+                );
+                out.push((number, text));
+            }
+        }
+        out.sort_by_key(|(number, _)| *number);
+        out.into_iter().map(|(_, text)| text).collect()
+    }
+
+    /// The better of the nominal's structure and the scan's own.
+    fn or_own(&self, own: Structure, sample: &[Point3<f64>]) -> Chosen {
+        let n = self.part.bends.len();
+        let line = CentreLine::measure(sample, &own.model, true);
+        let correlation = line.correlation(&own.model);
+        let mine = fitted(&line, self.best.model.clone(), self.prior, correlation, FULL_STEPS);
+        let other = fitted(&line, own.model.clone(), own.prior, correlation, 0);
+        let bends = other.model.lra.bends.len();
+        let sure = self.is_determined();
+        let formed = self.is_formed_of_the_nominal();
+        // The nominal's, but for what its further bends cost no worse: the free search spared itself the shallow ones.
+        let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
+        let spared = formed && mine.score - saved <= other.score;
+        if sure && (mine.score <= other.score || spared) {
+            return (self.structure(), self.resting());
+        }
+        let groups = self.groups(&other.model);
+        if bends == n && groups.is_empty() {
+            let guided = if sure { self.structure() } else { own };
+            return (guided, self.resting());
+        }
+        let what = if bends == 1 { "bend" } else { "bends" };
+        let list = if groups.is_empty() { String::new() } else { format!("; {}", groups.join("; ")) };
+        (own, vec![format!("the scan by itself shows {bends} {what}, the nominal has {n}{list}")])
+    }
+
+    /// Bend by bend of the nominal where the other model has other angles there, both in figures.
+    fn groups(&self, other: &TubeModel) -> Vec<String> {
+        let spine = self.best.model.spine();
+        let middle = |i: usize| {
+            let arc = &spine.segments()[2 * i + 1];
+            arc.start_mm + 0.5 * arc.length_mm
+        };
+        let n = self.part.bends.len();
+        let mut there: Vec<Vec<f64>> = vec![Vec::new(); n];
+        let theirs = other.spine();
+        for (k, bend) in other.lra.bends.iter().enumerate() {
+            let arc = &theirs.segments()[2 * k + 1];
+            let point = arc.frame_at(0.5 * arc.length_mm).translation.vector.into();
+            let at = spine.closest(&point).arc_length_mm;
+            let nearest = (0..n).min_by(|a, b| (middle(*a) - at).abs().total_cmp(&(middle(*b) - at).abs()));
+            there[nearest.unwrap_or(0)].push(bend.angle_rad);
+        }
+        let mut out: Vec<(usize, String)> = Vec::new();
+        for (i, angles) in there.iter().enumerate() {
+            let angle = self.best.model.lra.bends[i].angle_rad;
+            let same = SAME_ANGLE_RAD + SIGMAS * self.angle_sigma_rad(i);
+            if angles.len() != 1 || (angles[0] - angle).abs() > same {
+                let mut theirs: Vec<String> =
+                    angles.iter().map(|a| format!("{:.2}", a.to_degrees())).collect();
+                if self.reversed {
+                    theirs.reverse();
+                }
+                let own = if theirs.is_empty() { "none".to_owned() } else { theirs.join(" + ") };
+                let number = self.number(i);
+                let mine = angle.to_degrees();
+                let text =
+                    format!("bend {number}: {mine:.2} by the nominal's structure, {own} by the scan's own");
+                out.push((number, text));
+            }
+        }
+        out.sort_by_key(|(number, _)| *number);
+        out.into_iter().map(|(_, text)| text).collect()
+    }
+}
