@@ -10,6 +10,7 @@ use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
 use super::measure;
 use super::moments::Sample;
 use super::outline::solid_start;
+use super::profile;
 use super::scene::Scene;
 use super::stretches::correlation;
 use super::structure::Structure;
@@ -43,6 +44,7 @@ pub fn finish(
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
     // Sigmas by what the points say together, not by their number.
+    best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
     best.covariance *= correlation(&whole, &best);
     let mut ends = end_points(&whole, sample, &best);
     let mut measured = measure::measure(&mut best, &mut ends);
@@ -51,6 +53,7 @@ pub fn finish(
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
     }
     measured.residual_median_mm = best.median_mm;
+    measured.decisions.clone_from(&chosen.decisions);
     measured.points_total = cloud.len();
     measured.warnings.splice(0..0, scene.warnings);
     let TubeModel { lra, ovality_mm, .. } = best.model.clone();

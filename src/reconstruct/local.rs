@@ -149,7 +149,10 @@ impl Local {
     pub fn across(&self, p: [f64; 3]) -> (f64, f64) {
         match &self.arc {
             None => (p[1], p[2]),
-            Some(arc) => (p[0].hypot(p[1] - arc.radius_mm) - arc.radius_mm, p[2]),
+            Some(arc) => {
+                let qy = p[1] - arc.radius_mm;
+                ((p[0] * p[0] + qy * qy).sqrt() - arc.radius_mm, p[2])
+            }
         }
     }
 
@@ -165,11 +168,11 @@ impl Local {
 
     /// Signed distance of a point from the tube's surface, outside positive.
     pub fn residual_mm(&self, p: [f64; 3], tube_radius_mm: f64) -> f64 {
-        let Some(arc) = &self.arc else { return p[1].hypot(p[2]) - tube_radius_mm };
-        let outward = p[0].hypot(p[1] - arc.radius_mm) - arc.radius_mm;
-        let distance = outward.hypot(p[2]).max(1e-12);
+        let (u, v) = self.across(p);
+        let distance = (u * u + v * v).sqrt().max(1e-12);
+        let Some(arc) = &self.arc else { return distance - tube_radius_mm };
         let oval_mm = arc.ovality_mm * self.ramp_at(p, tube_radius_mm);
-        distance - Oval::at(outward / distance, p[2] / distance, tube_radius_mm, oval_mm).radius_mm
+        distance - Oval::at(u / distance, v / distance, tube_radius_mm, oval_mm).radius_mm
     }
 }
 

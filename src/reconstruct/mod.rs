@@ -2,8 +2,8 @@
 //!
 //! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
 //! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, polygon by
-//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), least
-//! squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
+//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), how
+//! many bends ([`structure`], on a thinned cloud), least squares on all points, ends and sigmas ([`finish`]).
 
 pub mod apollonius;
 pub mod arcline;
@@ -15,7 +15,7 @@ mod ends;
 mod error;
 mod evidence;
 mod face;
-mod finish;
+pub mod finish;
 pub mod fit;
 mod lanes;
 mod local;
@@ -43,6 +43,7 @@ use nalgebra::Point3;
 use crate::cloud::PointCloud;
 use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
 use model::TubeModel;
+use scene::Scene;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -77,11 +78,16 @@ impl Reconstruction {
 /// Cell of the sample that decides the structure, in tube radii.
 const SAMPLE_CELL_RADII: f64 = 0.2;
 
+/// The points that decide the structure.
+pub fn sample(scene: &Scene) -> Vec<Point3<f64>> {
+    scene.thin.thinned(SAMPLE_CELL_RADII * scene.radius_mm).iter().collect()
+}
+
 /// Reconstructs the tube that the cloud shows.
 pub fn reconstruct(cloud: &PointCloud, options: &Options) -> Result<Reconstruction, ReconstructError> {
     let scene = scene::look(cloud, options.nominal)?;
     let (radius_mm, polygon) = (scene.radius_mm, &scene.polygon);
-    let sample: Vec<Point3<f64>> = scene.thin.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
+    let sample = sample(&scene);
     let not_bent = || ReconstructError::NotBent {
         length_mm: crust::length_mm(polygon),
         radius_mm,

@@ -61,7 +61,7 @@ fn add(sums: &mut Sums, local: &Local, p: [f64; 3], radius_mm: f64, cutoff_mm: f
         return;
     }
     let (u, v) = local.across(p);
-    let size = u.hypot(v).max(1e-12);
+    let size = (u * u + v * v).sqrt().max(1e-12);
     let (c, s) = (u / size, v / size);
     let h = [1.0, c, s, c * c - s * s, 2.0 * s * c, residual_mm];
     let mut at = 0;
