@@ -147,9 +147,10 @@ fn of_two_tubes_one_is_measured_and_both_are_named() {
     let one = scanned(8_000, 7);
     let mut points = one.points.clone();
     points.extend(one.points.iter().map(|p| p + Vector3::new(0.0, 0.0, 400.0)));
-    let found = reconstruct(&PointCloud::from_points(&points), &Options::default()).unwrap();
+    let cloud = PointCloud::from_points(&points);
+    let found = reconstruct(&cloud, &Options::default()).unwrap();
     assert_eq!(found.measured.bends.len(), 4);
-    assert_eq!(found.residuals_mm.len(), points.len());
+    assert_eq!(found.residuals_mm(&cloud).len(), points.len());
     assert!(found.measured.warnings[0].contains("2 separate tubes"), "{:?}", found.measured.warnings);
 }
 

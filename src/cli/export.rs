@@ -74,8 +74,9 @@ impl Export {
     }
 
     fn write_cloud(&self, scan: &MeasuredScan) -> anyhow::Result<()> {
-        let (scale, residuals) = (Scale::of(&scan.found), &scan.found.residuals_mm);
+        let residuals = scan.found.residuals_mm(&scan.cloud);
+        let scale = Scale::of(&scan.found, &residuals);
         let colours: Vec<[u8; 3]> = residuals.iter().map(|r| scale.colour(*r)).collect();
-        Ok(write_coloured_ply(&self.path, &scan.cloud, &colours, residuals)?)
+        Ok(write_coloured_ply(&self.path, &scan.cloud, &colours, &residuals)?)
     }
 }

@@ -43,6 +43,8 @@ pub struct Fit {
     pub cutoff_mm: f64,
     /// Points that count.
     pub used: usize,
+    /// Median size of their residuals.
+    pub median_mm: f64,
     /// Passes over the points.
     pub passes: usize,
     /// Why it stopped.
@@ -85,7 +87,7 @@ pub struct RadiusPrior {
 }
 
 /// Fits the model to the sample. The cut-off shrinks from `effort.cutoff_mm` to six standard deviations.
-pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
+pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
     let parameters = start.parameters();
     let mut cutoff = effort.cutoff_mm;
     let mut passes = 0;
@@ -98,7 +100,7 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
     let mut state = descend(sample, start.clone(), &parameters, effort.prior, way(cutoff));
     passes += state.passes;
     for _ in 0..effort.rounds {
-        let sigma = robust_sigma(&sample.residuals(&state.model), cutoff);
+        let sigma = robust_sigma(&state.pass, cutoff);
         let next = (CUTOFF_SIGMAS * sigma).min(cutoff);
         if next > 0.95 * cutoff {
             break;
@@ -107,12 +109,13 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
         state = descend(sample, state.model, &parameters, effort.prior, way(cutoff));
         passes += state.passes;
     }
-    let sigma_mm = robust_sigma(&sample.residuals(&state.model), cutoff);
+    let sigma_mm = robust_sigma(&state.pass, cutoff);
     let (normal, _) = equations(&state.pass.moments, &state.model, &parameters);
     let covariance = invert(&normal) * state.pass.variance_mm2(parameters.len());
     Fit {
         cost: state.pass.cost,
-        used: state.pass.used,
+        used: state.pass.used(),
+        median_mm: state.pass.median_mm(cutoff).unwrap_or(0.0),
         model: state.model,
         stop: state.stop,
         parameters,
@@ -123,15 +126,52 @@ pub fn fit(sample: &mut Sample, start: &TubeModel, effort: Effort) -> Fit {
     }
 }
 
-/// Standard deviation of the residuals within the cut-off from the median of their size.
-fn robust_sigma(residuals: &[f64], cutoff_mm: f64) -> f64 {
-    let mut sizes: Vec<f64> = residuals.iter().map(|r| r.abs()).filter(|r| *r < cutoff_mm).collect();
-    if sizes.is_empty() {
-        return cutoff_mm;
+/// A step this small, in standard deviations of the estimate, is none.
+const SMALL_STEP_SIGMAS: f64 = 0.03;
+
+/// Takes a model that is nearly there to all points: Newton's steps, cut-off and all, until what is left is nothing beside
+/// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once.
+pub fn polish(data: &mut impl Data, start: &TubeModel, effort: Effort) -> Option<Fit> {
+    let parameters = start.parameters();
+    let mut model = start.clone();
+    let mut cutoff_mm = effort.cutoff_mm;
+    let mut before = f64::INFINITY;
+    for passes in 1..=effort.steps {
+        let pass = data.pass(&model, cutoff_mm);
+        let sigma_mm = robust_sigma(&pass, cutoff_mm);
+        let (normal, gradient) = full_equations(&model, &pass, &parameters, &effort.prior, sigma_mm);
+        let step = damped_step(&normal, &gradient, 1e-12)? * pass.shortfall();
+        let variance = pass.variance_mm2(parameters.len());
+        let size = -gradient.dot(&step) / variance.max(1e-300);
+        let next_cutoff_mm = (CUTOFF_SIGMAS * sigma_mm).min(cutoff_mm);
+        if size < SMALL_STEP_SIGMAS.powi(2) && next_cutoff_mm > 0.95 * cutoff_mm {
+            let (normal, _) = equations(&pass.moments, &model, &parameters);
+            return Some(Fit {
+                covariance: invert(&normal) * variance,
+                cost: pass.cost,
+                used: pass.used(),
+                median_mm: pass.median_mm(cutoff_mm).unwrap_or(0.0),
+                stop: Stop::Converged,
+                model,
+                parameters,
+                sigma_mm,
+                cutoff_mm,
+                passes,
+            });
+        }
+        if size > 0.5 * before {
+            return None;
+        }
+        before = size;
+        cutoff_mm = next_cutoff_mm;
+        model = model.stepped(&parameters, &step);
     }
-    let middle = sizes.len() / 2;
-    let (_, median, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
-    (*median * MEDIAN_TO_SIGMA).max(1e-6)
+    None
+}
+
+/// Standard deviation of the residuals within the cut-off from the median of their size.
+fn robust_sigma(pass: &Pass, cutoff_mm: f64) -> f64 {
+    pass.median_mm(cutoff_mm).map_or(cutoff_mm, |m| (m * MEDIAN_TO_SIGMA).max(1e-6))
 }
 
 /// Where a descent ended.

@@ -15,6 +15,32 @@ pub struct Local {
     pub to_local: Isometry3<f64>,
     pub length_mm: f64,
     pub arc: Option<Arc>,
+    /// Directions from an arc's centre that face it, and those where its section is as oval as it gets.
+    facing: Sector,
+    oval: Sector,
+}
+
+/// Directions between two, as turns from the arc's start; told without an arc tangent.
+#[derive(Debug, Clone, Copy)]
+struct Sector {
+    /// Sine and cosine of both ends.
+    begin: (f64, f64),
+    end: (f64, f64),
+    width_rad: f64,
+}
+
+impl Sector {
+    fn new(begin_rad: f64, end_rad: f64) -> Sector {
+        Sector { begin: begin_rad.sin_cos(), end: end_rad.sin_cos(), width_rad: end_rad - begin_rad }
+    }
+
+    /// Whether the direction with this sine and cosine (times any length) lies between the ends.
+    fn holds(&self, sin: f64, cos: f64) -> bool {
+        let after = sin * self.begin.1 - cos * self.begin.0 >= 0.0;
+        let before = cos * self.end.0 - sin * self.end.1 >= 0.0;
+        let both = after && before;
+        if self.width_rad > std::f64::consts::PI { after || before } else { both && self.width_rad > 0.0 }
+    }
 }
 
 /// What makes an arc.
@@ -27,15 +53,19 @@ pub struct Arc {
 /// The segments of the model, line, arc, ..., line.
 pub fn prepare(model: &TubeModel) -> Vec<Local> {
     let spine = model.spine();
-    let local = |(k, s): (usize, &crate::tube::Segment)| Local {
-        to_local: s.start.inverse(),
-        length_mm: s.length_mm,
-        arc: match s.kind {
+    let local = |(k, s): (usize, &crate::tube::Segment)| {
+        let (mut facing, mut oval) = (Sector::new(0.0, 0.0), Sector::new(0.0, 0.0));
+        let arc = match s.kind {
             SegmentKind::Arc { radius_mm, angle_rad } => {
-                Some(Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] })
+                let arc = Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] };
+                let full = arc.full_ramp_mm(model.tube_radius_mm) / radius_mm;
+                facing = Sector::new(0.0, angle_rad);
+                oval = Sector::new(full, angle_rad - full);
+                Some(arc)
             }
             SegmentKind::Line => None,
-        },
+        };
+        Local { to_local: s.start.inverse(), length_mm: s.length_mm, arc, facing, oval }
     };
     spine.segments().iter().enumerate().map(local).collect()
 }
@@ -92,6 +122,60 @@ impl Local {
     }
 }
 
+impl Local {
+    /// Square of a point's distance from the segment's axis; infinite beside an arc.
+    pub fn square_from_axis(&self, p: [f64; 3]) -> f64 {
+        let [x, y, z] = p;
+        match &self.arc {
+            None => {
+                let past = x - x.clamp(0.0, self.length_mm);
+                past * past + y * y + z * z
+            }
+            Some(arc) if self.facing.holds(x, arc.radius_mm - y) => {
+                let qy = arc.radius_mm - y;
+                let outward = (x * x + qy * qy).sqrt() - arc.radius_mm;
+                outward * outward + z * z
+            }
+            Some(_) => f64::INFINITY,
+        }
+    }
+
+    /// Where along the segment a point lies, 0 to 1.
+    pub fn share_along(&self, p: [f64; 3]) -> f64 {
+        (self.along_mm(&p.into()) / self.length_mm.max(1e-12)).clamp(0.0, 1.0)
+    }
+
+    /// A point's place across the axis; from the outside of a bend.
+    pub fn across(&self, p: [f64; 3]) -> (f64, f64) {
+        match &self.arc {
+            None => (p[1], p[2]),
+            Some(arc) => {
+                let qy = p[1] - arc.radius_mm;
+                ((p[0] * p[0] + qy * qy).sqrt() - arc.radius_mm, p[2])
+            }
+        }
+    }
+
+    /// How oval the section is where a point faces the segment: [`Arc::ramp`].
+    pub fn ramp_at(&self, p: [f64; 3], tube_radius_mm: f64) -> f64 {
+        let Some(arc) = &self.arc else { return 0.0 };
+        let (x, y) = (p[0], arc.radius_mm - p[1]);
+        if self.oval.holds(x, y) {
+            return 1.0;
+        }
+        arc.ramp(x.atan2(y).rem_euclid(std::f64::consts::TAU), tube_radius_mm)
+    }
+
+    /// Signed distance of a point from the tube's surface, outside positive.
+    pub fn residual_mm(&self, p: [f64; 3], tube_radius_mm: f64) -> f64 {
+        let (u, v) = self.across(p);
+        let distance = (u * u + v * v).sqrt().max(1e-12);
+        let Some(arc) = &self.arc else { return distance - tube_radius_mm };
+        let oval_mm = arc.ovality_mm * self.ramp_at(p, tube_radius_mm);
+        distance - Oval::at(u / distance, v / distance, tube_radius_mm, oval_mm).radius_mm
+    }
+}
+
 /// An oval section: an ellipse with half axes radius + oval towards the outside of the bend and radius - oval across.
 pub struct Oval {
     /// The section's radius in a direction.
@@ -121,12 +205,17 @@ impl Oval {
 }
 
 impl Arc {
+    /// Over what length from its ends the section becomes as oval as it gets.
+    fn full_ramp_mm(&self, tube_radius_mm: f64) -> f64 {
+        (OVAL_RAMP_RADII * tube_radius_mm).min(0.5 * self.angle_rad * self.radius_mm)
+    }
+
     /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
     /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
     /// speed of convergence.
     pub fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
         let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
-        let full = (OVAL_RAMP_RADII * tube_radius_mm).min(0.5 * self.angle_rad * self.radius_mm);
+        let full = self.full_ramp_mm(tube_radius_mm);
         0.5 - 0.5 * (std::f64::consts::PI * (from_end / full.max(1e-12)).clamp(0.0, 1.0)).cos()
     }
 }

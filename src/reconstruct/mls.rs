@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
 use super::radius::{JET_RADII, Near, median};
-use crate::cloud::{Neighbours, PointCloud};
+use crate::cloud::{Grid, Neighbours, PointCloud};
 use crate::recognize::{Jet, fit_jet};
 
 /// Distance of the spine's points, in tube radii.
@@ -52,14 +52,14 @@ pub struct SpinePoint {
 /// Projects a thinned set of the cloud's points onto the spine: what the jets guess is gathered first, so that one
 /// cylinder per place is fitted, from a good start.
 pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
-    let index = Neighbours::new(work);
     let seeds = work.thinned(SEED_CELL_RADII * radius_mm);
     let reach = JET_RADII * radius_mm;
+    let index = Grid::new(work, reach);
     let jets: Vec<Option<Jet>> = (0..seeds.len())
         .into_par_iter()
         .map_init(Near::default, |near, i| {
             let p = seeds.point(i);
-            fit_jet(&p, near.within(work, &index, &p, reach), reach)
+            fit_jet(&p, near.within(&index, &p, reach), reach)
         })
         .collect();
     let error = |j: &Jet| (j.strong_per_mm * radius_mm - 1.0).abs();
@@ -75,7 +75,7 @@ pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
     let places = condense(&guesses, GUESS_SPACING_RADII * radius_mm);
     let found: Vec<Option<Projected>> = places
         .par_iter()
-        .map_init(Near::default, |near, place| project(place, radius_mm, near, work, &index))
+        .map_init(Near::default, |near, place| project(place, radius_mm, near, &index))
         .collect();
     strongest(found.into_iter().flatten().collect(), radius_mm)
 }
@@ -119,15 +119,9 @@ enum Stand {
 }
 
 /// One projection: a cylinder from the guessed axis, and the outlier rules.
-fn project(
-    place: &SpinePoint,
-    radius_mm: f64,
-    near: &mut Near,
-    work: &PointCloud,
-    index: &Neighbours,
-) -> Option<Projected> {
+fn project(place: &SpinePoint, radius_mm: f64, near: &mut Near, index: &Grid) -> Option<Projected> {
     let start = Cylinder::guess(place.point, place.tangent, radius_mm);
-    let points = near.within(work, index, &start.centre, REACH_RADII * radius_mm);
+    let points = near.within(index, &start.centre, REACH_RADII * radius_mm);
     let cylinder = fit_cylinder(points, &start, false)?;
     let fits = cylinder.opening > LEAST_OPENING && cylinder.share > LEAST_SHARE;
     let spine = SpinePoint { point: cylinder.centre, tangent: cylinder.axis };

@@ -2,8 +2,8 @@
 //!
 //! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
 //! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, polygon by
-//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), least
-//! squares on all points ([`fit`], [`moments`]), ends and sigmas ([`measure`]).
+//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), how
+//! many bends ([`structure`], on a thinned cloud), least squares on all points, ends and sigmas ([`finish`]).
 
 pub mod apollonius;
 pub mod arcline;
@@ -15,8 +15,10 @@ mod ends;
 mod error;
 mod evidence;
 mod face;
+pub mod finish;
 pub mod fit;
 mod guided;
+mod lanes;
 mod likeness;
 mod local;
 mod measure;
@@ -34,22 +36,22 @@ pub mod radius;
 pub mod scene;
 mod sections;
 pub mod simplify;
+mod stretches;
 pub mod structure;
+mod whole;
 
 pub use error::ReconstructError;
 use nalgebra::Point3;
 
 use crate::cloud::PointCloud;
 use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
-use fit::{Effort, fit};
-use moments::Sample;
-use sections::CentreLine;
+use model::TubeModel;
+use scene::Scene;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Options<'a> {
-    /// The part that the scan should show: the fit starts from its bends (see `guided`), and its direction of travel
-    /// becomes the measurement's.
+    /// The part that the scan should show: its direction of travel becomes the measurement's.
     pub nominal: Option<&'a Nominal>,
 }
 
@@ -62,18 +64,27 @@ pub struct Reconstruction {
     pub lra: Lra,
     /// The centre line in the scan's coordinates, end to end.
     pub spine: Spine,
-    /// Signed distance of every point of the cloud from the fitted surface, in the cloud's order.
-    pub residuals_mm: Vec<f64>,
+    /// How oval each bend's section is, see [`TubeModel::ovality_mm`].
+    pub ovality_mm: Vec<f64>,
+}
+
+impl Reconstruction {
+    /// Signed distance of every point of a cloud from the fitted surface, in the cloud's order.
+    pub fn residuals_mm(&self, cloud: &PointCloud) -> Vec<f64> {
+        let start = self.spine.frame_at(0.0);
+        let mut model = TubeModel::round(start, self.lra.clone(), self.measured.tube_radius_mm);
+        model.ovality_mm.clone_from(&self.ovality_mm);
+        whole::residuals_mm(cloud, &model)
+    }
 }
 
 /// Cell of the sample that decides the structure, in tube radii.
 const SAMPLE_CELL_RADII: f64 = 0.2;
 
-/// An angle is never left open: a tube with one less certain than this was not measured.
-const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
-
-/// Share of the points that must lie on the tube.
-const LEAST_USED_SHARE: f64 = 0.5;
+/// The points that decide the structure.
+pub fn sample(scene: &Scene) -> Vec<Point3<f64>> {
+    scene.thin.thinned(SAMPLE_CELL_RADII * scene.radius_mm).iter().collect()
+}
 
 /// What [`reconstruct_watched`] begins, for those who wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -116,60 +127,25 @@ fn by(
 ) -> Result<Reconstruction, ReconstructError> {
     begins(Stage::CentreLine);
     let scene = scene::look(cloud, options.nominal)?;
-    let (radius_mm, polygon) = (scene.radius_mm, scene.polygon);
-    let own: Vec<Point3<f64>> = match &scene.own {
-        Some(own) => own.iter().map(|&i| cloud.point(i as usize)).collect(),
-        None => cloud.iter().collect(),
-    };
-    let points = own.len();
-    let sample: Vec<Point3<f64>> = scene.thin.thinned(SAMPLE_CELL_RADII * radius_mm).iter().collect();
+    let (radius_mm, polygon) = (scene.radius_mm, &scene.polygon);
+    let sample = sample(&scene);
     let not_bent = || ReconstructError::NotBent {
-        length_mm: crust::length_mm(&polygon),
+        length_mm: crust::length_mm(polygon),
         radius_mm,
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
     let chosen = match guide {
-        Some(nominal) => guided::choose(&polygon, &sample, radius_mm, nominal),
-        None => structure::choose(&polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
+        Some(nominal) => guided::choose(polygon, &sample, radius_mm, nominal),
+        None => structure::choose(polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
     };
     let (chosen, notes) = chosen.ok_or_else(not_bent)?;
-    let model = chosen.model;
-    if moves::is_free_form(&model.lra, radius_mm) {
+    if moves::is_free_form(&chosen.model.lra, radius_mm) {
         return Err(not_bent());
     }
     begins(Stage::Fit);
-    let mut all = Sample::new(own, &model);
-    let mut best = fit(
-        &mut all,
-        &model,
-        Effort { cutoff_mm: 6.0 * chosen.noise_mm, rounds: 2, steps: 20, prior: chosen.prior },
-    );
-    if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
-        let bends = best.model.lra.bends.len();
-        return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
-    }
-    // Sigmas by what the points say together, not by their number (see `CentreLine::correlation`).
-    best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
-    best.covariance *= CentreLine::measure(&all.points, &best.model, true).correlation(&best.model);
-    let mut measured = measure::measure(&mut best, &mut all);
-    if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
-        let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
-        return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
-    }
-    let own_residuals_mm = all.residuals(&best.model);
-    let mut used: Vec<f64> =
-        own_residuals_mm.iter().map(|r| r.abs()).filter(|r| *r < best.cutoff_mm).collect();
-    measured.residual_median_mm = radius::median(&mut used).unwrap_or(0.0);
-    measured.decisions = chosen.decisions;
-    measured.points_total = cloud.len();
-    measured.warnings.splice(0..0, scene.warnings.into_iter().chain(notes));
-    // The points of the surroundings have a distance from the tube too.
-    let residuals_mm = match scene.own {
-        Some(_) => Sample::new(cloud.iter().collect(), &best.model).residuals(&best.model),
-        None => own_residuals_mm,
-    };
-    let found = Reconstruction { measured, spine: best.model.spine(), lra: best.model.lra, residuals_mm };
+    let mut found = finish::finish(cloud, scene, sample, &chosen)?;
+    found.measured.warnings.extend(notes);
     Ok(match options.nominal {
         Some(nominal) => direction::as_nominal(found, nominal),
         None => found,

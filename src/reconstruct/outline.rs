@@ -124,7 +124,7 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<Out
 }
 
 /// First coordinate from which on the points come as densely as usual: stray points before it do not count.
-fn solid_start(sorted: &[f64], reach_mm: f64) -> Option<f64> {
+pub(super) fn solid_start(sorted: &[f64], reach_mm: f64) -> Option<f64> {
     let last = *sorted.last()?;
     let window = 0.1 * reach_mm;
     let count_from = |i: usize| sorted[i..].partition_point(|x| *x < sorted[i] + window);

@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
-use crate::cloud::{Neighbours, PointCloud};
+use crate::cloud::{Grid, PointCloud};
 use crate::recognize::{Jet, fit_jet};
 
 /// Neighbourhood of a jet in tube radii (paper 000, section 7).
@@ -113,13 +113,13 @@ fn readings(cloud: &PointCloud, spacing_mm: f64) -> Vec<Reading> {
     let mut readings = Vec::new();
     let mut scale = 2.0 * spacing_mm;
     let mut thinned: Option<PointCloud> = None;
-    let mut index = Neighbours::new(cloud);
+    let mut index = Grid::new(cloud, 2.0 * scale);
     let mut cell = spacing_mm;
     while scale < SUITS.end * widest {
         if scale / ACROSS > LEVEL_STEP * cell {
             cell = scale / ACROSS;
             let next = thinned.as_ref().unwrap_or(cloud).thinned(cell);
-            index = Neighbours::new(&next);
+            index = Grid::new(&next, 2.0 * scale);
             thinned = Some(next);
         }
         let level = thinned.as_ref().unwrap_or(cloud);
@@ -136,40 +136,32 @@ fn places(cloud: &PointCloud, most: usize) -> Vec<Point3<f64>> {
 }
 
 /// Jets at a number of places of the cloud; None where there is none.
-fn jets_at(cloud: &PointCloud, index: &Neighbours, scale: f64, places: &[Point3<f64>]) -> Vec<Option<Jet>> {
+fn jets_at(index: &Grid, scale: f64, places: &[Point3<f64>]) -> Vec<Option<Jet>> {
     places
         .par_iter()
-        .map_init(Near::default, |near, p| fit_jet(p, near.within(cloud, index, p, scale), scale))
+        .map_init(Near::default, |near, p| fit_jet(p, near.within(index, p, scale), scale))
         .collect()
 }
 
 /// Room for the points of one neighbourhood, used again and again.
 #[derive(Default)]
 pub(super) struct Near {
-    indices: Vec<u32>,
     points: Vec<Point3<f64>>,
 }
 
 impl Near {
     /// The points within a radius.
-    pub fn within(
-        &mut self,
-        cloud: &PointCloud,
-        index: &Neighbours,
-        p: &Point3<f64>,
-        radius_mm: f64,
-    ) -> &[Point3<f64>] {
-        index.within(p, radius_mm, &mut self.indices);
+    pub fn within(&mut self, index: &Grid, p: &Point3<f64>, radius_mm: f64) -> &[Point3<f64>] {
         self.points.clear();
-        self.points.extend(self.indices.iter().map(|&i| cloud.point(i as usize)));
+        index.for_each_within(p, radius_mm, |_, way| self.points.push(p + way));
         &self.points
     }
 }
 
 /// The radius on which most places agree at one scale, of those that the scale suits.
-fn read_at(cloud: &PointCloud, index: &Neighbours, scale: f64) -> Option<Reading> {
+fn read_at(cloud: &PointCloud, index: &Grid, scale: f64) -> Option<Reading> {
     let places = places(cloud, PLACES);
-    let jets = jets_at(cloud, index, scale, &places);
+    let jets = jets_at(index, scale, &places);
     let mut logs: Vec<f64> = jets
         .iter()
         .flatten()
@@ -193,15 +185,15 @@ fn densest(sorted: &[f64], width: f64) -> Option<(usize, usize)> {
 /// enough.
 fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
     let work = cloud.thinned(0.13 * radius_mm);
-    let index = Neighbours::new(&work);
+    let index = Grid::new(&work, REACH_RADII * radius_mm);
     let places = places(&work, JUDGES);
     let fitted: Vec<(f64, bool, f64)> = places
         .par_iter()
         .map_init(Near::default, |near, p| {
             let reach = JET_RADII * radius_mm;
-            let jet = fit_jet(p, near.within(&work, &index, p, reach), reach)?;
+            let jet = fit_jet(p, near.within(&index, p, reach), reach)?;
             let start = Cylinder::guess(jet.foot - jet.normal * radius_mm, jet.weak_direction, radius_mm);
-            let points = near.within(&work, &index, &start.centre, REACH_RADII * radius_mm);
+            let points = near.within(&index, &start.centre, REACH_RADII * radius_mm);
             let cylinder = fit_cylinder(points, &start, true)?;
             let straight = (jet.weak_per_mm * radius_mm).abs() < STRAIGHT;
             (cylinder.share > LEAST_SHARE).then_some((cylinder.radius_mm, straight, cylinder.rms_mm))

@@ -45,11 +45,11 @@ pub struct Scale {
 }
 
 impl Scale {
-    /// The scale that suits a reconstruction.
-    pub fn of(found: &Reconstruction) -> Scale {
+    /// The scale that suits a reconstruction and the deviations of its cloud.
+    pub fn of(found: &Reconstruction, residuals_mm: &[f64]) -> Scale {
         let noise_mm = SIGMA_PER_MEDIAN * found.measured.residual_median_mm;
         // The points that the fit used are those next to the surface.
-        let mut sizes: Vec<f64> = found.residuals_mm.iter().map(|r| r.abs()).collect();
+        let mut sizes: Vec<f64> = residuals_mm.iter().map(|r| r.abs()).collect();
         let used = found.measured.points_used.min(sizes.len());
         let place = (0.98 * used.saturating_sub(1) as f64) as usize;
         let most =

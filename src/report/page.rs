@@ -46,8 +46,9 @@ pub fn html(about: &About, found: &Reconstruction, cloud: &PointCloud) -> String
 
 fn page_into(page: &mut String, about: &About, found: &Reconstruction, cloud: &PointCloud) -> Result {
     let tube = &found.measured;
-    let scale = Scale::of(found);
-    let surface = Surface::of(found, cloud, &scale, MOST_POINTS);
+    let residuals_mm = found.residuals_mm(cloud);
+    let scale = Scale::of(found, &residuals_mm);
+    let surface = Surface::of(found, cloud, &residuals_mm, &scale, MOST_POINTS);
     let file = escape(about.file);
     writeln!(page, "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>")?;
     writeln!(page, "<meta name=\"viewport\" content=\"width=device-width\"/>")?;
@@ -55,7 +56,7 @@ fn page_into(page: &mut String, about: &About, found: &Reconstruction, cloud: &P
     head(page, about, tube, &scale)?;
     table(page, tube)?;
     warnings(page, tube)?;
-    pictures(page, found, &surface, &scale)?;
+    pictures(page, found, &surface, &residuals_mm, &scale)?;
     decisions(page, tube)?;
     writeln!(page, "</body>\n</html>")
 }
@@ -136,7 +137,13 @@ fn warnings(page: &mut String, tube: &MeasuredTube) -> Result {
     writeln!(page, "</div>\n</section>")
 }
 
-fn pictures(page: &mut String, found: &Reconstruction, surface: &Surface, scale: &Scale) -> Result {
+fn pictures(
+    page: &mut String,
+    found: &Reconstruction,
+    surface: &Surface,
+    residuals_mm: &[f64],
+    scale: &Scale,
+) -> Result {
     let radius_mm = found.measured.tube_radius_mm;
     writeln!(page, "<section>\n<h2>Deviation of the points from the fitted tube</h2>")?;
     let mut svg = String::new();
@@ -164,7 +171,7 @@ fn pictures(page: &mut String, found: &Reconstruction, surface: &Surface, scale:
     )?;
     writeln!(page, "<section>\n<h2>How the deviations are spread</h2>")?;
     svg.clear();
-    histogram::draw(&mut svg, &found.residuals_mm, scale)?;
+    histogram::draw(&mut svg, residuals_mm, scale)?;
     figure(page, 270.0, &svg)?;
     writeln!(page, "</section>")
 }

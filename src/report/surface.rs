@@ -41,14 +41,20 @@ pub struct Surface {
 }
 
 impl Surface {
-    /// Looks at `most` points at most.
-    pub fn of(found: &Reconstruction, cloud: &PointCloud, scale: &Scale, most: usize) -> Surface {
+    /// Looks at `most` points at most; `residuals_mm`: the deviations of all.
+    pub fn of(
+        found: &Reconstruction,
+        cloud: &PointCloud,
+        residuals_mm: &[f64],
+        scale: &Scale,
+        most: usize,
+    ) -> Surface {
         let turns_rad = turns(&found.spine);
         let (near, far): (Vec<usize>, Vec<usize>) =
-            thin(cloud.len(), most).partition(|&i| found.residuals_mm[i].abs() <= scale.near_mm);
+            thin(cloud.len(), most).partition(|&i| residuals_mm[i].abs() <= scale.near_mm);
         let radius_mm = found.measured.tube_radius_mm;
         let spot = |&i: &usize| Spot {
-            deviation_mm: found.residuals_mm[i],
+            deviation_mm: residuals_mm[i],
             ..Spot::of(&found.spine, &turns_rad, radius_mm, cloud.point(i))
         };
         let spots = near.par_iter().map(spot).collect();

@@ -1,0 +1,94 @@
+//! The last part of the reconstruction: the structure that a sample has shown, fitted to all points and measured.
+//!
+//! After `structure`, which leaves the fit near its end: one step on all points takes it there, another pass says so.
+//! All passes are walks over the cloud as it lies in memory (`whole`).
+
+use nalgebra::Point3;
+
+use super::error::ReconstructError;
+use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
+use super::measure;
+use super::moments::Sample;
+use super::outline::solid_start;
+use super::profile;
+use super::scene::Scene;
+use super::stretches::correlation;
+use super::structure::Structure;
+use super::whole::Whole;
+use super::{Reconstruction, TubeModel};
+use crate::cloud::PointCloud;
+
+/// An angle is never left open: a tube with one less certain than this was not measured.
+const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
+
+/// Share of the points that must lie on the tube.
+const LEAST_USED_SHARE: f64 = 0.5;
+
+/// Of larger clouds only so much of the end straights is looked at for the ends, in tube radii: a little more than the
+/// ends ask for.
+const MANY_POINTS: usize = 100_000;
+const END_RADII: f64 = 8.5;
+
+/// Fits and measures the tube.
+pub fn finish(
+    cloud: &PointCloud,
+    scene: Scene,
+    sample: Vec<Point3<f64>>,
+    chosen: &Structure,
+) -> Result<Reconstruction, ReconstructError> {
+    let mut whole = Whole::new(cloud, scene.own.as_deref());
+    let points = whole.len();
+    let mut best = fit_to_all(&mut whole, chosen);
+    if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
+        let (radius_mm, bends) = (scene.radius_mm, best.model.lra.bends.len());
+        return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
+    }
+    // Sigmas by what the points say together, not by their number.
+    best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
+    best.covariance *= correlation(&whole, &best);
+    let mut ends = end_points(&whole, sample, &best);
+    let mut measured = measure::measure(&mut best, &mut ends);
+    if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
+        let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
+        return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
+    }
+    measured.residual_median_mm = best.median_mm;
+    measured.decisions.clone_from(&chosen.decisions);
+    measured.points_total = cloud.len();
+    measured.warnings.splice(0..0, scene.warnings);
+    let TubeModel { lra, ovality_mm, .. } = best.model.clone();
+    Ok(Reconstruction { measured, spine: best.model.spine(), lra, ovality_mm })
+}
+
+/// The sample's fit taken to all points.
+fn fit_to_all(whole: &mut Whole, chosen: &Structure) -> Fit {
+    let cutoff_mm = CUTOFF_SIGMAS * chosen.noise_mm;
+    let effort = Effort { cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior };
+    polish(whole, &chosen.model, effort).unwrap_or_else(|| fit(whole, &chosen.model, effort))
+}
+
+/// The points that show the tube's ends.
+fn end_points(whole: &Whole, sample: Vec<Point3<f64>>, fit: &Fit) -> Sample {
+    if whole.len() <= MANY_POINTS {
+        return whole.ends(&fit.model, fit.cutoff_mm, f64::INFINITY, f64::INFINITY);
+    }
+    let mut sample = Sample::new(sample, &fit.model);
+    let (first_mm, last_mm) = reaches(&mut sample, &fit.model);
+    whole.ends(&fit.model, fit.cutoff_mm, first_mm, last_mm)
+}
+
+/// How far along the end straights, from the model's ends, points show the tube's ends.
+fn reaches(sample: &mut Sample, model: &TubeModel) -> (f64, f64) {
+    let spine = model.spine();
+    let last = spine.segments().len() - 1;
+    let reach = |segment: usize, along: &dyn Fn(f64) -> f64| {
+        let inverse = spine.segments()[segment].start.inverse();
+        let mine = sample.points.iter().zip(sample.segments()).filter(|(_, s)| **s as usize == segment);
+        let mut places: Vec<f64> = mine.map(|(p, _)| along((inverse * p).x)).collect();
+        places.sort_by(f64::total_cmp);
+        let first = solid_start(&places, 2.0 * model.tube_radius_mm);
+        first.map_or(f64::INFINITY, |at| at + END_RADII * model.tube_radius_mm)
+    };
+    let length_mm = spine.segments()[last].length_mm;
+    (reach(0, &|x| x), reach(last, &|x| length_mm - x))
+}

@@ -1,0 +1,252 @@
+//! All points of the tube, for the last part of the reconstruction: walked where they lie, in chunks on all cores.
+//!
+//! Between `finish` and the cloud. A point is looked for where the one before it was: in a file's order that is nearly
+//! always the same segment, and the surface there tells. Only where it does not are all segments asked.
+
+use nalgebra::Point3;
+use rayon::prelude::*;
+
+use super::fit::Data;
+use super::lanes::Adder;
+use super::local::{Local, prepare};
+use super::model::TubeModel;
+use super::moments::{CHUNK, Pass, Sample};
+use crate::cloud::PointCloud;
+
+/// Chunks at most: their sums take room.
+const MOST_CHUNKS: usize = 64;
+
+/// The tube is taken to go on this many radii beyond its first guess of the ends.
+const BEYOND_RADII: f64 = 2.0;
+
+/// A cloud's points, or those of them that are the tube's.
+#[derive(Debug, Clone, Copy)]
+pub struct Whole<'a> {
+    cloud: &'a PointCloud,
+    own: Option<&'a [u32]>,
+}
+
+/// A segment as the cloud's offsets see it.
+struct View {
+    turn: [[f64; 3]; 3],
+    shift: [f64; 3],
+    /// Range along a straight.
+    range_mm: (f64, f64),
+}
+
+/// A model ready for a walk.
+struct Walk {
+    locals: Vec<Local>,
+    views: Vec<View>,
+    /// Squares of the distances from the axis between which a point is on the surface beyond doubt.
+    on_surface: (f64, f64),
+}
+
+impl<'a> Whole<'a> {
+    /// All points, or those with these indices.
+    pub fn new(cloud: &'a PointCloud, own: Option<&'a [u32]>) -> Whole<'a> {
+        Whole { cloud, own }
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.own.map_or(self.cloud.len(), <[u32]>::len)
+    }
+
+    /// Walks all points. Each is given to `add` with its segment and its place in that segment's frame; one `new` per
+    /// chunk, in order.
+    pub fn walk<S: Send>(
+        &self,
+        model: &TubeModel,
+        near_mm: f64,
+        new: impl Fn() -> S + Sync,
+        add: impl Fn(&mut S, usize, [f64; 3]) + Sync,
+    ) -> Vec<S> {
+        let walk = Walk::new(model, self.cloud.origin(), near_mm);
+        let chunk = self.len().div_ceil(MOST_CHUNKS).max(CHUNK);
+        let through = |offsets: &mut dyn Iterator<Item = [f32; 3]>| {
+            let (mut sums, mut segment) = (new(), 0);
+            for offset in offsets {
+                let place = walk.find(offset, &mut segment);
+                add(&mut sums, segment, place);
+            }
+            sums
+        };
+        let all = self.cloud.offsets();
+        match self.own {
+            None => all.par_chunks(chunk).map(|part| through(&mut part.iter().copied())).collect(),
+            Some(own) => own
+                .par_chunks(chunk)
+                .map(|part| through(&mut part.iter().map(|&i| all[i as usize])))
+                .collect(),
+        }
+    }
+
+    /// The points of the first and of the last straight that lie no farther along it than `first_mm`, or no farther
+    /// from its end than `last_mm`.
+    pub fn ends(&self, model: &TubeModel, near_mm: f64, first_mm: f64, last_mm: f64) -> Sample {
+        let spine = model.spine();
+        let last = spine.segments().len() - 1;
+        let from_last = spine.segments()[last].length_mm - last_mm;
+        let parts = self.walk(model, near_mm, Vec::new, |kept, segment, p| {
+            if (segment == 0 && p[0] <= first_mm) || (segment == last && p[0] >= from_last) {
+                kept.push((spine.segments()[segment].start * Point3::from(p), segment as u32));
+            }
+        });
+        Sample::settled(parts.into_iter().flatten())
+    }
+}
+
+impl Data for Whole<'_> {
+    fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
+        let locals = prepare(model);
+        let new = || Adder::new(&locals, model, cutoff_mm);
+        let parts = self.walk(model, cutoff_mm, new, |adder, segment, p| adder.add(segment, p));
+        Pass::total(locals.len(), parts.into_iter().map(Adder::finish))
+    }
+}
+
+impl Walk {
+    fn new(model: &TubeModel, origin: Point3<f64>, near_mm: f64) -> Walk {
+        let locals = prepare(model);
+        let last = locals.len() - 1;
+        let radius = model.tube_radius_mm;
+        let view = |(k, local): (usize, &Local)| {
+            let turn = local.to_local.rotation.to_rotation_matrix();
+            let beyond = |end: bool| if end { BEYOND_RADII * radius } else { 0.0 };
+            View {
+                turn: std::array::from_fn(|row| std::array::from_fn(|column| turn[(row, column)])),
+                shift: (local.to_local * origin).into(),
+                range_mm: (-beyond(k == 0), local.length_mm + beyond(k == last)),
+            }
+        };
+        let views = locals.iter().enumerate().map(view).collect();
+        let on_surface = ((radius - near_mm).max(0.0).powi(2), (radius + near_mm).powi(2));
+        Walk { locals, views, on_surface }
+    }
+
+    /// Puts the segment that a point faces into `segment`; returns its place there.
+    fn find(&self, offset: [f32; 3], segment: &mut usize) -> [f64; 3] {
+        let offset = offset.map(f64::from);
+        let place = self.views[*segment].see(offset);
+        if self.explains(*segment, place) {
+            return place;
+        }
+        let beside = [*segment + 1, segment.wrapping_sub(1)];
+        for k in beside.into_iter().filter(|k| *k < self.views.len()) {
+            let place = self.views[k].see(offset);
+            if self.explains(k, place) {
+                *segment = k;
+                return place;
+            }
+        }
+        let distances = self.views.iter().zip(&self.locals).map(|(v, l)| l.square_from_axis(v.see(offset)));
+        let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+        *segment = nearest.map_or(0, |n| n.0);
+        self.views[*segment].see(offset)
+    }
+
+    /// Whether a point lies on a segment's surface.
+    fn explains(&self, segment: usize, p: [f64; 3]) -> bool {
+        let square = match &self.locals[segment].arc {
+            None => {
+                let (from, to) = self.views[segment].range_mm;
+                if p[0] < from || p[0] > to {
+                    return false;
+                }
+                p[1] * p[1] + p[2] * p[2]
+            }
+            Some(_) => self.locals[segment].square_from_axis(p),
+        };
+        self.on_surface.0 <= square && square <= self.on_surface.1
+    }
+}
+
+impl View {
+    fn see(&self, p: [f64; 3]) -> [f64; 3] {
+        let row = |k: usize| {
+            let turn = &self.turn[k];
+            turn[0] * p[0] + turn[1] * p[1] + turn[2] * p[2] + self.shift[k]
+        };
+        [row(0), row(1), row(2)]
+    }
+}
+
+/// Signed distances of all points of a cloud from a model's surface, in the cloud's order.
+pub fn residuals_mm(cloud: &PointCloud, model: &TubeModel) -> Vec<f64> {
+    let locals = prepare(model);
+    let radius = model.tube_radius_mm;
+    // On the surface to a tenth of the radius: beyond doubt.
+    let parts = Whole::new(cloud, None).walk(model, 0.1 * radius, Vec::new, |out, segment, p| {
+        out.push(locals[segment].residual_mm(p, radius));
+    });
+    parts.concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tube::{Bend, Frame, Lra};
+    use nalgebra::Vector3;
+
+    /// A tube that comes back on itself, with points on, in and around it, in no order.
+    fn case(points: usize) -> (TubeModel, PointCloud) {
+        let bend = |length_mm, rotation_rad, angle_rad, radius_mm| Bend {
+            length_mm,
+            rotation_rad,
+            angle_rad,
+            radius_mm,
+        };
+        let bends = vec![bend(60.0, 0.0, 3.1, 25.0), bend(40.0, 2.0, 3.6, 31.0), bend(0.5, -0.7, 0.1, 28.0)];
+        let mut model = TubeModel::round(
+            Frame::new(Vector3::new(5.0, -7.0, 300.0), Vector3::new(0.4, -1.0, 0.3)),
+            Lra { bends, last_length_mm: 50.0 },
+            10.0,
+        );
+        model.ovality_mm = vec![-0.4, 0.3, -0.2];
+        let spine = model.spine();
+        let at = |i: usize| {
+            let turn = 2.4 * i as f64;
+            let radius = 10.0 + 0.05 * (1.7 * i as f64).sin() - if i % 50 == 0 { 6.0 } else { 0.0 };
+            let frame = spine.frame_at((0.618_034 * i as f64).fract() * spine.length_mm());
+            frame * Point3::new(0.0, radius * turn.cos(), radius * turn.sin())
+        };
+        (model, PointCloud::from_points(&(0..points).map(at).collect::<Vec<_>>()))
+    }
+
+    #[test]
+    fn every_point_finds_its_segment() {
+        let (model, cloud) = case(5000);
+        let found = residuals_mm(&cloud, &model);
+        let expected = Sample::new(cloud.iter().collect(), &model).residuals(&model);
+        for (i, (a, b)) in found.iter().zip(&expected).enumerate() {
+            assert!((a - b).abs() < 1e-9, "point {i}: {a} {b}");
+        }
+    }
+
+    #[test]
+    fn the_pass_is_the_samples() {
+        let (model, cloud) = case(5000);
+        let own: Vec<u32> = (0..cloud.len() as u32).filter(|i| i % 3 != 0).collect();
+        let points = own.iter().map(|&i| cloud.point(i as usize)).collect();
+        let expected = Sample::new(points, &model).pass(&model, 0.2);
+        let found = Whole::new(&cloud, Some(&own)).pass(&model, 0.2);
+        assert_eq!(found.used(), expected.used());
+        assert!((found.cost / expected.cost - 1.0).abs() < 1e-9);
+        for (a, b) in found.moments.iter().zip(&expected.moments) {
+            assert!((a - b).amax() <= 1e-9 * b.amax());
+        }
+    }
+
+    #[test]
+    fn sums_do_not_depend_on_the_number_of_threads() {
+        let (model, cloud) = case(20_000);
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| Whole::new(&cloud, None).pass(&model, 0.2))
+        };
+        let (one, three) = (run(1), run(3));
+        assert_eq!(one.cost.to_bits(), three.cost.to_bits());
+        assert_eq!(one.moments, three.moments);
+    }
+}
