@@ -14,6 +14,9 @@ use crate::tube::{Segment, SegmentKind, Spine};
 const MOST_SPOTS: usize = 18_000;
 const MOST_OTHERS: usize = 3_000;
 
+/// Layers of dots, even.
+const LAYERS: usize = 6;
+
 const WIDTH: f64 = 1100.0;
 const MOST_HIGH: f64 = 620.0;
 /// Around every view, for numbers.
@@ -149,8 +152,19 @@ fn tube(
         let style = "stroke-linejoin=\"round\" stroke-width";
         polyline(svg, &line, &format!("stroke=\"#c5ccd3\" {style}=\"{:.1}\"", wide + 1.4))?;
         polyline(svg, &line, &format!("stroke=\"#f7f8fa\" {style}=\"{wide:.1}\""))?;
-        for class in 0..CLASSES {
-            let mine = spots.iter().filter(|s| s.segment == k && s.outward.dot(&view.eye) > 0.05);
+        let mine: Vec<&Spot> =
+            spots.iter().filter(|s| s.segment == k && s.outward.dot(&view.eye) > 0.05).collect();
+        layers(svg, view, &mine, scale)?;
+    }
+    Ok(())
+}
+
+/// Dots cover others: in layers that begin with either end of the scale in turn, so that no colour is on top of all.
+fn layers(svg: &mut String, view: &View, spots: &[&Spot], scale: &Scale) -> Result {
+    for layer in 0..LAYERS {
+        for k in 0..CLASSES {
+            let class = if layer % 2 == 0 { k } else { CLASSES - 1 - k };
+            let mine = spots.iter().skip(layer).step_by(LAYERS);
             let mine = mine.filter(|s| scale.class(s.deviation_mm) == class);
             dots(svg, view, mine.map(|s| &s.point), &class_colour(class))?;
         }
