@@ -35,7 +35,7 @@ pub struct Bound {
 pub fn cramer_rao(truth: &TubeModel, points: Vec<Point3<f64>>, noise_mm: f64) -> Bound {
     let parameters = truth.parameters();
     let pass = Sample::new(points, truth).pass(truth, NO_CUTOFF_MM);
-    let (normal, _) = equations(&pass.moments, &truth, &parameters);
+    let (normal, _) = equations(&pass.moments, truth, &parameters);
     let ends = Ends::default();
     let jacobian = jacobian(truth, &parameters, &ends);
     let covariance = &jacobian * invert(&normal) * jacobian.transpose();

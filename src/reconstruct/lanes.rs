@@ -3,6 +3,8 @@
 //! Under `moments`. Points are collected by segment and worked off when a bucket is full, in loops over arrays of fixed
 //! size, which the compiler turns into vector instructions.
 
+#![allow(clippy::needless_range_loop)] // one index for all that lies side by side
+
 use super::local::{Arc, Local, Oval};
 use super::model::TubeModel;
 use super::moments::{Moment, Pass};

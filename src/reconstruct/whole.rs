@@ -207,7 +207,7 @@ mod tests {
         let spine = model.spine();
         let at = |i: usize| {
             let turn = 2.4 * i as f64;
-            let radius = 10.0 + 0.05 * (1.7 * i as f64).sin() - if i % 50 == 0 { 6.0 } else { 0.0 };
+            let radius = 10.0 + 0.05 * (1.7 * i as f64).sin() - if i.is_multiple_of(50) { 6.0 } else { 0.0 };
             let frame = spine.frame_at((0.618_034 * i as f64).fract() * spine.length_mm());
             frame * Point3::new(0.0, radius * turn.cos(), radius * turn.sin())
         };
@@ -227,7 +227,7 @@ mod tests {
     #[test]
     fn the_pass_is_the_samples() {
         let (model, cloud) = case(5000);
-        let own: Vec<u32> = (0..cloud.len() as u32).filter(|i| i % 3 != 0).collect();
+        let own: Vec<u32> = (0..cloud.len() as u32).filter(|i| !i.is_multiple_of(3)).collect();
         let points = own.iter().map(|&i| cloud.point(i as usize)).collect();
         let expected = Sample::new(points, &model).pass(&model, 0.2);
         let found = Whole::new(&cloud, Some(&own)).pass(&model, 0.2);
