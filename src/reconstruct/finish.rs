@@ -45,7 +45,7 @@ pub fn finish(
     }
     // Sigmas by what the points say together, not by their number.
     best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
-    best.covariance *= correlation(&whole, &best);
+    best.covariance *= 1.0 + (correlation(&whole, &best) - 1.0) * chosen.persistence;
     let mut ends = end_points(&whole, sample, &best);
     let mut measured = measure::measure(&mut best, &mut ends);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {

@@ -50,6 +50,9 @@ const OVAL_DOUBT: f64 = 1e-5;
 const OVAL_DOUBT_SHARE: f64 = 0.15;
 const OVAL_DOUBT_RADII: f64 = 1.2;
 
+/// Neighbouring sections are taken to follow each other no more than this.
+const MOST_FOLLOWING: f64 = 0.9;
+
 /// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.
 const JUDGED_POINTS: f64 = 8.0;
 const MEDIAN_CHI2: f64 = 4.351;
@@ -182,7 +185,23 @@ impl CentreLine {
             }
         });
         let usual = median(&mut excess).unwrap_or(0.0) / (self.noise_mm * self.noise_mm);
-        (usual / MEDIAN_CHI2).max(1.0)
+        1.0 + ((usual / MEDIAN_CHI2).max(1.0) - 1.0) * self.persistence(model)
+    }
+
+    /// How many neighbouring sections say one thing where they differ from the model: 1 when each lies off to a side of
+    /// its own. From how often neighbours lie off to the same side, so that a local misfit counts little; as if each
+    /// followed the one before (first-order autoregression).
+    pub fn persistence(&self, model: &TubeModel) -> f64 {
+        let mut offs: Vec<Vector3<f64>> = Vec::new();
+        self.walk(model, |section, _, values, _| {
+            let best = solve(&section.sums, &SPREADS.map(|s| s * self.radius_mm), self.noise_mm);
+            let off = best - values;
+            offs.push(section.across[0] * off[1] + section.across[1] * off[2]);
+        });
+        let pairs = offs.len().saturating_sub(1).max(1) as f64;
+        let alike = offs.windows(2).filter(|w| w[0].dot(&w[1]) > 0.0).count() as f64 / pairs;
+        let follows = (std::f64::consts::PI * (alike - 0.5)).sin().clamp(0.0, MOST_FOLLOWING);
+        (1.0 + follows) / (1.0 - follows)
     }
 
     /// Moments of every section with the segment that it faces, in order along the tube.
