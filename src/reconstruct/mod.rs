@@ -35,6 +35,8 @@ mod places;
 mod profile;
 pub mod radius;
 pub mod scene;
+#[cfg(test)]
+mod search_tests;
 mod sections;
 pub mod simplify;
 mod stretches;

@@ -1,0 +1,139 @@
+//! The measured centre line and what is searched on it: derivatives against finite differences, evidence against truth.
+
+use nalgebra::{DVector, Point3, Vector3};
+use proptest::prelude::*;
+
+use super::evidence::Solved;
+use super::fit::{Data, Way, descend};
+use super::model::TubeModel;
+use super::moves::{merged, without_bend};
+use super::normal;
+use super::sections::CentreLine;
+use crate::tube::{Bend, Frame, Lra};
+
+fn bend(length_mm: f64, rotation_rad: f64, angle_rad: f64) -> Bend {
+    Bend { length_mm, rotation_rad, angle_rad, radius_mm: 40.0 }
+}
+
+fn tube(bends: Vec<Bend>) -> TubeModel {
+    let start = Frame::new(Vector3::new(5.0, -7.0, 30.0), Vector3::new(0.4, -1.0, 0.3));
+    TubeModel::round(start, Lra { bends, last_length_mm: 120.0 }, 10.0)
+}
+
+fn three_bends() -> TubeModel {
+    let mut model = tube(vec![bend(100.0, 0.0, 1.2), bend(60.0, 1.0, 0.9), bend(45.0, -0.7, 0.05)]);
+    model.ovality_mm = vec![-0.3, -0.2, 0.0];
+    model
+}
+
+/// Points of half the surface of a round tube, off by a fixed pattern of the given size.
+fn points(model: &TubeModel, noise_mm: f64) -> Vec<Point3<f64>> {
+    let spine = model.spine();
+    let place = |i: usize| {
+        let along = (i as f64 * 0.618_034).fract() * spine.length_mm();
+        let around = 2.6 * ((i as f64 * 0.414_214).fract() - 0.5);
+        // Near enough to normal: the sum of three uniform numbers.
+        let off: f64 = [0.731, 0.303, 0.557].iter().map(|s| (i as f64 * s).fract() - 0.5).sum();
+        let radius = model.tube_radius_mm + 2.0 * noise_mm * off;
+        spine.frame_at(along) * Point3::new(0.0, radius * around.cos(), radius * around.sin())
+    };
+    (0..12_000).map(place).collect()
+}
+
+fn round_of(model: &TubeModel) -> TubeModel {
+    TubeModel { ovality_mm: vec![0.0; model.lra.bends.len()], ..model.clone() }
+}
+
+fn way(noise_mm: f64) -> Way {
+    Way { cutoff_mm: f64::INFINITY, noise_mm, steps: 60, goal: f64::INFINITY }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn the_gradient_is_that_of_finite_differences(seed in 0u64..1000, common in any::<bool>()) {
+        let mut model = three_bends();
+        model.common_radius = common;
+        let line = CentreLine::measure(&points(&round_of(&model), 0.03), &round_of(&model), true);
+        let parameters = model.parameters();
+        // Somewhere near the base, the same for the same seed.
+        let away = DVector::from_fn(parameters.len(), |j, _| {
+            1e-3 * (((seed + 1) * (j as u64 + 3) % 17) as f64 / 17.0 - 0.5)
+        });
+        let model = model.moved(&parameters, &away);
+        let cost = |m: &TubeModel| line.clone().pass(m, f64::INFINITY).cost;
+        let pass = line.clone().pass(&model, f64::INFINITY);
+        let (matrix, gradient) = normal::equations(&pass.moments, &model, &parameters);
+        for j in 0..parameters.len() {
+            let h = 1e-5;
+            let at = |d: f64| {
+                let step = DVector::from_fn(parameters.len(), |k, _| if k == j { d } else { 0.0 });
+                cost(&model.moved(&parameters, &step))
+            };
+            let numeric = (at(h) - at(-h)) / (2.0 * h);
+            // The ramp of the ovality and the base's curvature are left out of the derivatives.
+            let scale = 0.03 * (2.0 * pass.cost * matrix[(j, j)]).sqrt() + 1e-6;
+            prop_assert!((gradient[j] - numeric).abs() < scale, "{:?}: {} {numeric}", parameters[j], gradient[j]);
+        }
+    }
+}
+
+#[test]
+fn the_noise_is_the_sections_own_whatever_the_structure() {
+    let truth = round_of(&three_bends());
+    let points = points(&truth, 0.03);
+    let right = CentreLine::measure(&points, &truth, true);
+    // A base without the shallow bend: off by up to 0.05 rad times the rest of the tube.
+    let wrong = CentreLine::measure(&points, &without_bend(&truth, 2), false);
+    assert!((wrong.noise_mm / right.noise_mm - 1.0).abs() < 0.3, "{} {}", wrong.noise_mm, right.noise_mm);
+    assert!(right.correlation(&truth) < 1.2);
+}
+
+#[test]
+fn a_bend_that_the_model_lacks_shows_as_a_joint_where_it_is() {
+    let truth = round_of(&three_bends());
+    let less = without_bend(&truth, 2);
+    let points = points(&truth, 0.03);
+    let mut line = CentreLine::measure(&points, &less, false);
+    let parameters = less.parameters();
+    let noise_mm = line.noise_mm;
+    let fitted = descend(&mut line, less, &parameters, None, way(noise_mm)).model;
+    let joints = Solved::new(&line, &fitted, &parameters).joints(&line, &fitted, &parameters, noise_mm);
+    let best = joints.iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).unwrap();
+    let arc = truth.spine().segments()[5];
+    assert!(best.gain > 100.0, "{best:?}");
+    assert!((best.at_mm - arc.start_mm).abs() < 20.0, "{best:?} {}", arc.start_mm);
+    // About the right tube no joint is worth its four values.
+    let mut line = CentreLine::measure(&points, &truth, true);
+    let parameters = truth.parameters();
+    let fitted = descend(&mut line, truth, &parameters, None, way(noise_mm)).model;
+    let joints = Solved::new(&line, &fitted, &parameters).joints(&line, &fitted, &parameters, noise_mm);
+    assert!(joints.iter().all(|j| j.gain < 30.0), "{:?}", joints.iter().map(|j| j.gain).fold(0.0, f64::max));
+}
+
+#[test]
+fn a_fit_to_the_sections_finds_the_tube() {
+    let truth = round_of(&three_bends());
+    let points = points(&truth, 0.03);
+    let parameters = truth.parameters();
+    let off = DVector::from_fn(parameters.len(), |j, _| if j < 6 { 0.0 } else { 0.01 * (j % 3) as f64 });
+    let start = truth.moved(&parameters, &off);
+    let mut line = CentreLine::measure(&points, &truth, true);
+    let found = descend(&mut line, start, &parameters, None, way(0.03)).model;
+    for (a, b) in found.lra.bends.iter().zip(&truth.lra.bends) {
+        assert!((a.angle_rad - b.angle_rad).abs() < 2e-4, "{a:?} {b:?}");
+    }
+}
+
+#[test]
+fn shallow_bends_in_two_planes_merge_into_their_joint_turn() {
+    let model = tube(vec![bend(100.0, 0.0, 0.08), bend(20.0, 1.2, 0.06), bend(80.0, 0.3, 1.0)]);
+    let one = merged(&model, 1).unwrap();
+    assert_eq!(one.lra.bends.len(), 2);
+    let angle = (0.08f64.powi(2) + 0.06f64.powi(2) + 2.0 * 0.08 * 0.06 * 1.2f64.cos()).sqrt();
+    assert!((one.lra.bends[0].angle_rad - angle).abs() < 1e-12);
+    // What follows keeps its length, and its place but for what the turns' order changes.
+    assert!((one.spine().length_mm() - model.spine().length_mm()).abs() < 1e-9);
+    let (a, b) = (one.spine(), model.spine());
+    assert!((a.point_at(a.length_mm()) - b.point_at(b.length_mm())).norm() < 1.5);
+}
