@@ -9,6 +9,7 @@ use super::error::ReconstructError;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
 use super::measure;
 use super::moments::Sample;
+use super::moves::without_bend;
 use super::outline::solid_start;
 use super::profile;
 use super::scene::Scene;
@@ -17,6 +18,7 @@ use super::structure::Structure;
 use super::whole::Whole;
 use super::{Reconstruction, TubeModel};
 use crate::cloud::PointCloud;
+use crate::tube::MeasuredTube;
 
 /// An angle is never left open: a tube with one less certain than this was not measured.
 const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
@@ -29,8 +31,55 @@ const LEAST_USED_SHARE: f64 = 0.5;
 const MANY_POINTS: usize = 100_000;
 const END_RADII: f64 = 8.5;
 
-/// Fits and measures the tube.
+/// Fits and measures the tube. A bend at one of its ends whose angle the points do not tell is a few points of
+/// something that touches the tube there, a jaw or a lip: it is left out, and that end's length is not known.
 pub fn finish(
+    cloud: &PointCloud,
+    scene: Scene,
+    sample: Vec<Point3<f64>>,
+    chosen: &Structure,
+) -> Result<Reconstruction, ReconstructError> {
+    let found = finish_as_chosen(cloud, scene.clone(), sample.clone(), chosen);
+    let Err(ReconstructError::Undetermined { bend, .. }) = &found else { return found };
+    let bends = chosen.model.lra.bends.len();
+    let (first, last) = (*bend == 1, *bend == bends);
+    if bends < 2 || !(first || last) {
+        return found;
+    }
+    let less = Structure { model: without_bend(&chosen.model, bend - 1), ..chosen.clone() };
+    let mut trimmed = finish_as_chosen(cloud, scene, sample, &less)?;
+    forget_end(&mut trimmed.measured, first);
+    Ok(trimmed)
+}
+
+/// An end beyond which something else than the tube was scanned.
+fn forget_end(tube: &mut MeasuredTube, first: bool) {
+    let end = if first { tube.bends.first_mut() } else { None };
+    let (length, sigma) = match end {
+        Some(bend) => (&mut bend.length_mm, &mut bend.length_sigma_mm),
+        None => (&mut tube.last_length_mm, &mut tube.last_length_sigma_mm),
+    };
+    (*length, *sigma) = (None, None);
+    let corner = if first { 0 } else { tube.intersection_mm.len().saturating_sub(1) };
+    if let (Some(value), Some(sigma)) =
+        (tube.intersection_mm.get_mut(corner), tube.intersection_sigma_mm.get_mut(corner))
+    {
+        (*value, *sigma) = (None, None);
+    }
+    let (cut, cut_sigma) = if first {
+        (&mut tube.first_cut_rad, &mut tube.first_cut_sigma_rad)
+    } else {
+        (&mut tube.last_cut_rad, &mut tube.last_cut_sigma_rad)
+    };
+    (*cut, *cut_sigma) = (None, None);
+    let which = if first { "first" } else { "last" };
+    tube.warnings.push(format!(
+        "the tube's {which} end is not known: something that touches it there was scanned with it, or a bend too little \
+         seen; its length is not given"
+    ));
+}
+
+fn finish_as_chosen(
     cloud: &PointCloud,
     scene: Scene,
     sample: Vec<Point3<f64>>,

@@ -42,7 +42,7 @@ pub fn with_common_radius(model: &TubeModel) -> TubeModel {
     out
 }
 
-/// The tube with bend `i` pulled straight.
+/// The tube with bend `i` pulled straight; the longer part beside it stays in place.
 pub fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
     let mut out = model.clone();
     let gone = out.lra.bends.remove(i);
@@ -56,6 +56,13 @@ pub fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
         None => out.lra.last_length_mm += length,
     }
     turn_into_pose(&mut out);
+    // The longer part stays where it is.
+    let (old, new) = (model.spine(), out.spine());
+    if let (Some(was), Some(is)) = (old.segments().get(2 * i + 3), new.segments().get(2 * i + 1))
+        && old.length_mm() - was.start_mm > was.start_mm
+    {
+        out.start = was.start * is.start.inverse() * out.start;
+    }
     out
 }
 
