@@ -76,7 +76,8 @@ fn sources(folder: &Path) -> Vec<PathBuf> {
 /// A test module in a file of its own; every one of them is called so.
 fn is_test(file: &Path) -> bool {
     let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
-    stem == "tests" || stem.ends_with("_tests")
+    let in_folder = file.parent().is_some_and(|folder| folder.ends_with("tests"));
+    stem == "tests" || stem.ends_with("_tests") || in_folder
 }
 
 /// The code of a source: without comments, which may name any room.

@@ -37,6 +37,7 @@ pub mod radius;
 pub mod scene;
 #[cfg(test)]
 mod search_tests;
+mod section;
 mod sections;
 pub mod simplify;
 mod stretches;

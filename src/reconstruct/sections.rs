@@ -6,29 +6,19 @@
 //! hundred times cheaper, and nothing is lost that a small change of the tube could show (the sums are sufficient
 //! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
 
-use nalgebra::{Cholesky, Matrix5, Point3, SMatrix, Vector3, Vector5};
+use nalgebra::{Matrix5, Point3, SMatrix, Vector3, Vector5};
 
 use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
 use super::radius::median;
-use crate::tube::{Spine, any_normal};
+use super::section::{
+    Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
+    solve,
+};
+use crate::tube::any_normal;
 
-/// Values of a section: radius, place along the first and second direction across, ovality along them and between.
-const VALUES: usize = 5;
-
-/// Weighted sums of the products of the values' derivatives and of the residual.
-type Sums = SMatrix<f64, 6, 6>;
-
-/// Length of a section in tube radii, and how many points it should hold.
-const SECTION_RADII: f64 = 0.5;
-const ENOUGH_POINTS: f64 = 15.0;
-/// Sections are no longer than this, however few the points.
-const LONGEST_RADII: f64 = 2.0;
-
-/// What is expected of the values before anything is measured, in tube radii.
-const SPREADS: [f64; VALUES] = [0.01, 0.3, 0.3, 0.02, 0.02];
 /// The same about a base that has been fitted, radius and ovality and all.
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
 
@@ -44,18 +34,8 @@ const CUTOFF_SIGMAS: f64 = 6.0;
 /// Median of |x| to standard deviation for normal errors.
 const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
-/// How far a section's ovality may differ from the model's, in tube radii; beside the tangent points, where it grows in
-/// some way or other, also this share of the bend's; and how far beside.
-const OVAL_DOUBT: f64 = 1e-5;
-const OVAL_DOUBT_SHARE: f64 = 0.15;
-const OVAL_DOUBT_RADII: f64 = 1.2;
-
 /// Neighbouring sections are taken to follow each other no more than this.
 const MOST_FOLLOWING: f64 = 0.9;
-
-/// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.
-const JUDGED_POINTS: f64 = 8.0;
-const MEDIAN_CHI2: f64 = 4.351;
 
 /// One short stretch of the tube.
 #[derive(Debug, Clone)]
@@ -130,11 +110,9 @@ impl CentreLine {
     pub fn measure(points: &[Point3<f64>], base: &TubeModel, fitted: bool) -> CentreLine {
         let spreads = if fitted { FITTED_SPREADS } else { SPREADS }.map(|s| s * base.tube_radius_mm);
         let spine = base.spine();
-        let per_radius = points.len() as f64 * base.tube_radius_mm / spine.length_mm().max(1e-9);
-        let radii = (ENOUGH_POINTS / per_radius).clamp(SECTION_RADII, LONGEST_RADII);
-        let bins = Bins::new(&spine, radii * base.tube_radius_mm);
+        let bins = Bins::new(&spine, base.tube_radius_mm, points.len());
         let seen = see(points, base, &bins);
-        let grouped = group(seen, bins.total());
+        let grouped = group(seen, bins.total);
         let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
@@ -297,16 +275,6 @@ fn predict(
     (values, derivatives)
 }
 
-/// The five values of a section.
-type Values = Vector5<f64>;
-
-/// Cost of values: sum of the squared residuals that they leave.
-fn cost(sums: &Sums, values: &Values) -> f64 {
-    let square = sums.fixed_view::<VALUES, VALUES>(0, 0);
-    let mixed = sums.fixed_view::<VALUES, 1>(0, VALUES);
-    sums[(VALUES, VALUES)] - 2.0 * mixed.dot(values) + (square * values).dot(values)
-}
-
 /// The moment of a section at the values that a model predicts.
 fn moment(sums: &Sums, values: &Values, derivatives: &SMatrix<f64, VALUES, ROWS>) -> Moment {
     let square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
@@ -343,16 +311,6 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
     sums
 }
 
-/// The values that fit best, held by what is expected where the points do not tell.
-fn solve(sums: &Sums, spreads_mm: &[f64; VALUES], noise_mm: f64) -> Values {
-    let mut square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
-    for (k, spread) in spreads_mm.iter().enumerate() {
-        square[(k, k)] += (noise_mm / spread).powi(2);
-    }
-    let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
-    Cholesky::new(square).map_or(Values::zeros(), |c| c.solve(&mixed))
-}
-
 /// Robust standard deviation of the points about their sections' fits.
 fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     let mut sizes = Vec::new();
@@ -366,30 +324,6 @@ fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     let n = sizes.len() as f64;
     let freedom = (n / (n - spent).max(1.0)).sqrt();
     median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
-}
-
-/// Lets the section's ovality differ from the model's by as much as `stiffness` (noise over spread) allows: the sums with
-/// that difference eliminated.
-fn doubt_ovality(sums: &mut Sums, stiffness: f64) {
-    let free: SMatrix<f64, 2, 2> =
-        sums.fixed_view::<2, 2>(3, 3) + SMatrix::identity() * (stiffness * stiffness);
-    let rows: SMatrix<f64, 2, 6> = sums.fixed_view::<2, 6>(3, 0).into_owned();
-    if let Some(inverse) = free.try_inverse() {
-        *sums -= rows.transpose() * (inverse * rows);
-    }
-}
-
-/// Spread of a section's ovality about the model's at a place of the base tube.
-fn oval_doubt_mm(base: &TubeModel, spine: &Spine, at_mm: f64) -> f64 {
-    let radius = base.tube_radius_mm;
-    let beside = |(i, e): (usize, &f64)| {
-        let arc = &spine.segments()[2 * i + 1];
-        let near = |tangent_mm: f64| (at_mm - tangent_mm).abs() < OVAL_DOUBT_RADII * radius;
-        let doubtful = near(arc.start_mm) || near(arc.start_mm + arc.length_mm);
-        if doubtful { OVAL_DOUBT_SHARE * e.abs() } else { 0.0 }
-    };
-    let most = base.ovality_mm.iter().enumerate().map(beside).fold(0.0, f64::max);
-    most.hypot(OVAL_DOUBT * radius)
 }
 
 /// Ovality of the base tube at a place of a segment, from the outside of its bend.
@@ -427,7 +361,7 @@ fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
             let (cos, sin) = (off.x / distance, off.y / distance);
             let round = Oval::at(cos, sin, base.tube_radius_mm, oval(base, k, along_mm));
             let residual_mm = distance - round.radius_mm;
-            let section = bins.of(k, along_mm);
+            let section = bins.of(k, along_mm / locals[k].length_mm.max(1e-12)) as u32;
             out.push(Seen { section, along_mm, cos, sin, residual_mm });
         }
     }
@@ -439,37 +373,4 @@ fn group(seen: Vec<Seen>, sections: usize) -> Vec<Vec<Seen>> {
     let mut out = vec![Vec::new(); sections];
     seen.into_iter().for_each(|s| out[s.section as usize].push(s));
     out
-}
-
-/// How the segments are cut into sections.
-struct Bins {
-    /// First section of every segment and one past the last.
-    first: Vec<usize>,
-    lengths_mm: Vec<f64>,
-}
-
-impl Bins {
-    fn new(spine: &Spine, length_mm: f64) -> Bins {
-        let mut first = vec![0];
-        for segment in spine.segments() {
-            let count = (segment.length_mm / length_mm).ceil().max(1.0) as usize;
-            first.push(first[first.len() - 1] + count);
-        }
-        Bins { first, lengths_mm: spine.segments().iter().map(|s| s.length_mm).collect() }
-    }
-
-    fn total(&self) -> usize {
-        self.first[self.first.len() - 1]
-    }
-
-    fn of(&self, segment: usize, along_mm: f64) -> u32 {
-        let count = self.first[segment + 1] - self.first[segment];
-        let share = (along_mm / self.lengths_mm[segment].max(1e-12)).clamp(0.0, 1.0);
-        (self.first[segment] + ((share * count as f64) as usize).min(count - 1)) as u32
-    }
-
-    /// The segment of every section.
-    fn places(&self) -> impl Iterator<Item = usize> + '_ {
-        (0..self.lengths_mm.len()).flat_map(|k| (self.first[k]..self.first[k + 1]).map(move |_| k))
-    }
 }
