@@ -5,6 +5,7 @@ use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
+use super::follow::followed;
 use super::radius::{JET_RADII, Near, median};
 use crate::cloud::{Grid, Neighbours, PointCloud};
 use crate::recognize::{Jet, fit_jet};
@@ -47,6 +48,8 @@ pub struct SpinePoint {
     pub point: Point3<f64>,
     /// Unit tangent, of either sign.
     pub tangent: Vector3<f64>,
+    /// Distance of the points from the cylinder that it is the axis of, root mean square.
+    pub rms_mm: f64,
 }
 
 /// Projects a thinned set of the cloud's points onto the spine: what the jets guess is gathered first, so that one
@@ -70,14 +73,14 @@ pub fn spine_cloud(work: &PointCloud, radius_mm: f64) -> Vec<SpinePoint> {
         .iter()
         .flatten()
         .filter(|j| error(j) <= allowed)
-        .map(|j| SpinePoint { point: j.foot - j.normal * radius_mm, tangent: j.weak_direction })
+        .map(|j| SpinePoint { point: j.foot - j.normal * radius_mm, tangent: j.weak_direction, rms_mm: 0.0 })
         .collect();
     let places = condense(&guesses, GUESS_SPACING_RADII * radius_mm);
     let found: Vec<Option<Projected>> = places
         .par_iter()
         .map_init(Near::default, |near, place| project(place, radius_mm, near, &index))
         .collect();
-    strongest(found.into_iter().flatten().collect(), radius_mm)
+    followed(strongest(found.into_iter().flatten().collect(), radius_mm), radius_mm)
 }
 
 /// A spine point and how many points bear it out.
@@ -124,7 +127,7 @@ fn project(place: &SpinePoint, radius_mm: f64, near: &mut Near, index: &Grid) ->
     let points = near.within(index, &start.centre, REACH_RADII * radius_mm);
     let cylinder = fit_cylinder(points, &start, false)?;
     let fits = cylinder.opening > LEAST_OPENING && cylinder.share > LEAST_SHARE;
-    let spine = SpinePoint { point: cylinder.centre, tangent: cylinder.axis };
+    let spine = SpinePoint { point: cylinder.centre, tangent: cylinder.axis, rms_mm: cylinder.rms_mm };
     fits.then_some((spine, cylinder.count as f64 * cylinder.share))
 }
 
@@ -155,7 +158,11 @@ pub fn condense(spine: &[SpinePoint], spacing_mm: f64) -> Vec<SpinePoint> {
         let turn = |s: &SpinePoint| s.tangent * s.tangent.dot(&spine[i].tangent).signum();
         let tangent = along.iter().map(|s| turn(s)).sum::<Vector3<f64>>().normalize();
         let forward = (points[i].coords - mean).dot(&tangent);
-        out.push(SpinePoint { point: Point3::from(mean + tangent * forward), tangent });
+        out.push(SpinePoint {
+            point: Point3::from(mean + tangent * forward),
+            tangent,
+            rms_mm: spine[i].rms_mm,
+        });
     }
     out
 }

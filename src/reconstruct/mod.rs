@@ -18,6 +18,7 @@ mod evidence;
 mod face;
 pub mod finish;
 pub mod fit;
+mod follow;
 mod guided;
 mod lanes;
 mod likeness;
