@@ -258,6 +258,7 @@ mod tests {
         let at = |t: f64| SpinePoint {
             point: Point3::new(100.0 * t.cos(), 100.0 * t.sin(), 5.0 * t),
             tangent: Vector3::new(-100.0 * t.sin(), 100.0 * t.cos(), 5.0).normalize(),
+            rms_mm: 0.0,
         };
         turns.map(at).collect()
     }

@@ -29,6 +29,9 @@ const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
 /// Noise over cut-off that is pretended while points are weighed.
 const FIRMNESS: f64 = 1.0;
+/// A section with a larger share of points that are near the tube and not on it tells nothing: a jaw grips the tube there, or
+/// it is an end with its face and its bore.
+const MOST_STRANGERS: f64 = 0.25;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 /// Median of |x| to standard deviation for normal errors.
@@ -129,7 +132,7 @@ impl CentreLine {
         for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
             let mut sums = sums(seen, fit, cutoff);
             let count = sums[(0, 0)];
-            if count < 1.0 {
+            if count < 1.0 || strangers(seen, fit, cutoff) > MOST_STRANGERS * seen.len() as f64 {
                 continue;
             }
             let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
@@ -309,6 +312,11 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
     }
     sums.fill_upper_triangle_with_lower_triangle();
     sums
+}
+
+/// Points near the tube that are not on it.
+fn strangers(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> f64 {
+    seen.iter().filter(|s| (s.residual_mm - s.row().dot(fit)).abs() > cutoff_mm).count() as f64
 }
 
 /// Robust standard deviation of the points about their sections' fits.
