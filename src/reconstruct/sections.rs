@@ -29,9 +29,10 @@ const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
 /// Noise over cut-off that is pretended while points are weighed.
 const FIRMNESS: f64 = 1.0;
-/// A section with a larger share of points that are near the tube and not on it tells nothing: a jaw grips the tube there, or
-/// it is an end with its face and its bore.
-const MOST_STRANGERS: f64 = 0.25;
+/// A section with a larger share of points near the tube and not on it tells nothing: outside it a jaw grips the tube there,
+/// inside it is an end with its face and its bore (which do less harm).
+const MOST_OUTSIDE: f64 = 0.25;
+const MOST_STRANGERS: f64 = 0.5;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 /// Median of |x| to standard deviation for normal errors.
@@ -132,7 +133,8 @@ impl CentreLine {
         for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
             let mut sums = sums(seen, fit, cutoff);
             let count = sums[(0, 0)];
-            if count < 1.0 || strangers(seen, fit, cutoff) > MOST_STRANGERS * seen.len() as f64 {
+            // Before the first fit the radius is a guess: all points may look like strangers.
+            if count < 1.0 || (fitted && is_crowded(seen, fit, cutoff)) {
                 continue;
             }
             let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
@@ -154,6 +156,11 @@ impl CentreLine {
         }
         let count = sections.iter().map(|s| s.count).sum();
         CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count }
+    }
+
+    /// Places at which a bend could be.
+    pub fn places(&self) -> usize {
+        self.sections.len()
     }
 
     /// By how much the sections scatter about the model, over what their points' noise explains: 1 for independent noise
@@ -314,9 +321,13 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
     sums
 }
 
-/// Points near the tube that are not on it.
-fn strangers(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> f64 {
-    seen.iter().filter(|s| (s.residual_mm - s.row().dot(fit)).abs() > cutoff_mm).count() as f64
+/// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
+fn is_crowded(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> bool {
+    let off = |s: &Seen| s.residual_mm - s.row().dot(fit);
+    let outside = seen.iter().filter(|s| off(s) > cutoff_mm).count() as f64;
+    let inside = seen.iter().filter(|s| off(s) < -cutoff_mm).count() as f64;
+    let all = seen.len() as f64;
+    outside > MOST_OUTSIDE * all || inside + outside > MOST_STRANGERS * all
 }
 
 /// Robust standard deviation of the points about their sections' fits.

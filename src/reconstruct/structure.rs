@@ -156,7 +156,11 @@ impl Jury {
     fn fit(&self, model: &TubeModel, steps: usize, goal: f64) -> Candidate {
         let parameters = model.parameters();
         let noise_mm = self.line.noise_mm;
-        let worth = (goal - self.price(parameters.len())) * self.correlation * noise_mm * noise_mm / 2.0;
+        let worth = (goal - self.price(parameters.len(), model.lra.bends.len()))
+            * self.correlation
+            * noise_mm
+            * noise_mm
+            / 2.0;
         let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth };
         let descent = descend(&mut self.line.clone(), model.clone(), &parameters, self.prior, way);
         self.scored(descent, parameters)
@@ -170,13 +174,16 @@ impl Jury {
     fn scored(&self, descent: Descent, parameters: Vec<Parameter>) -> Candidate {
         let noise_mm = self.line.noise_mm;
         let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / self.correlation;
-        let score = misfit + self.price(parameters.len());
+        let score = misfit + self.price(parameters.len(), descent.model.lra.bends.len());
         Candidate { model: descent.model, parameters, score }
     }
 
-    /// What a number of values costs.
-    fn price(&self, parameters: usize) -> f64 {
+    /// What a number of values costs; and each bend, that its place is the best of so many (extended information
+    /// criterion, J. Chen and Z. Chen, Biometrika 2008).
+    fn price(&self, parameters: usize, bends: usize) -> f64 {
+        let places = (self.line.places() as f64).max(1.0);
         parameters as f64 * (self.line.count / self.correlation).max(2.0).ln()
+            + 2.0 * bends as f64 * places.ln()
     }
 
     fn decide(&mut self, what: String, bend: Option<usize>, gain: f64, kept: bool) {
@@ -225,7 +232,7 @@ impl Jury {
             let at = best.parameters.iter().position(|p| *p == parameter);
             at.map_or(0.0, |j| value * value / (solved.inverse[(j, j)] * variance).max(1e-300))
         };
-        let bearable = DOUBT * self.price(5);
+        let bearable = DOUBT * self.price(5, 1);
         let bends = &model.lra.bends;
         let spine = model.spine();
         let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
@@ -270,7 +277,7 @@ impl Jury {
         let (mut best, mut score) = self.fit_points(&mut sample, &model);
         loop {
             let bends = &best.model.lra.bends;
-            let bearable = DOUBT * self.price(5) * self.correlation;
+            let bearable = DOUBT * self.price(5, 1) * self.correlation;
             let doubtful = |i: &usize| {
                 let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
                 at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
@@ -295,7 +302,7 @@ impl Jury {
         let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
         let found = fit(sample, model, Effort { cutoff_mm, rounds: 0, steps: FULL_STEPS, prior: self.prior });
         let misfit = 2.0 * found.cost / (noise_mm * noise_mm) / self.correlation;
-        let score = misfit + self.price(found.parameters.len());
+        let score = misfit + self.price(found.parameters.len(), model.lra.bends.len());
         (found, score)
     }
 
