@@ -94,9 +94,11 @@ fn finish_as_chosen(
     }
     // Sigmas by what the points say together, not by their number.
     best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
-    best.covariance *= 1.0 + (correlation(&whole, &best) - 1.0) * chosen.persistence;
+    let correlation = correlation(&whole, &best);
+    best.covariance *= correlation.near;
     let mut ends = end_points(&whole, sample, &best);
-    let mut measured = measure::measure(&mut best, &mut ends);
+    let mut measured =
+        measure::measure(&mut best, &mut ends, (correlation.along_arc / correlation.near).sqrt());
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });

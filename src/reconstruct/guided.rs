@@ -170,8 +170,7 @@ impl Guided {
     fn structure(&self) -> Structure {
         let (model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
         let held = lengths(&self.line, &model, self.correlation, self.prior);
-        let persistence = self.line.persistence(&model);
-        Structure { model, noise_mm, prior: self.prior, held, persistence, decisions: Vec::new() }
+        Structure { model, noise_mm, prior: self.prior, held, decisions: Vec::new() }
     }
 
     fn sigma(&self, parameter: Parameter) -> Option<f64> {

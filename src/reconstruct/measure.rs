@@ -40,15 +40,18 @@ pub(super) struct Values {
     pub tube_radius: Vec<f64>,
 }
 
-/// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values.
-pub fn measure(fit: &mut Fit, sample: &mut Sample) -> MeasuredTube {
+/// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values; the radii's are `radius_doubt`
+/// times what the covariance says.
+pub fn measure(fit: &mut Fit, sample: &mut Sample, radius_doubt: f64) -> MeasuredTube {
     let Scanned { ends, first, last } = set_ends(fit, sample);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
     let jacobian = jacobian(&fit.model, &fit.parameters, &ends);
     let covariance = &jacobian * &fit.covariance * jacobian.transpose();
     let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
-    let mut report = Report { sigma: at.like(sigmas), at, ends, first, last, warnings: Vec::new() };
+    let mut sigma = at.like(sigmas);
+    sigma.radii.iter_mut().for_each(|s| *s *= radius_doubt);
+    let mut report = Report { sigma, at, ends, first, last, warnings: Vec::new() };
     let n = fit.model.lra.bends.len();
     let bends = (0..n).map(|i| report.bend(i)).collect();
     let last_length = report.length(n);

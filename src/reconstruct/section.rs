@@ -3,7 +3,7 @@
 //!
 //! Under `sections` (the search's measured centre line) and `stretches` (what the last fit's residuals share).
 
-use nalgebra::{Cholesky, Matrix5, SMatrix, Vector5};
+use nalgebra::{Cholesky, Matrix5, SMatrix, Vector3, Vector5};
 
 use super::model::TubeModel;
 use crate::tube::Spine;
@@ -76,6 +76,25 @@ pub fn oval_doubt_mm(base: &TubeModel, spine: &Spine, at_mm: f64) -> f64 {
     most.hypot(OVAL_DOUBT * radius)
 }
 
+/// How many neighbouring sections say one thing, from the shifts across the tube by which they lie off the model, in order: 1
+/// when each lies off to a side of its own. One and twice the correlations (the variance of a mean of a stationary
+/// series over that of independent values) of sections up to `farthest` apart, each from how often two such
+/// sections lie off to the same side, so that a local misfit counts little; as far as they stand out of chance.
+pub fn persistence(offs: &[Vector3<f64>], farthest: usize) -> f64 {
+    let mut out = 1.0;
+    for apart in 1..=farthest.min(offs.len() / 4) {
+        let pairs = (offs.len() - apart) as f64;
+        let alike = (0..offs.len() - apart).filter(|&i| offs[i].dot(&offs[i + apart]) > 0.0).count();
+        // Of two normal values with that correlation.
+        let follows = (std::f64::consts::PI * (alike as f64 / pairs - 0.5)).sin();
+        if follows < std::f64::consts::FRAC_PI_2 / pairs.sqrt() {
+            break;
+        }
+        out += 2.0 * follows;
+    }
+    out
+}
+
 /// How the segments are cut into sections.
 pub struct Bins {
     /// First section of every segment, how many there are, where the segment begins, and its length.
@@ -114,5 +133,36 @@ impl Bins {
         self.segments.iter().flat_map(|&(_, count, start_mm, length_mm)| {
             (0..count).map(move |i| start_mm + (i as f64 + 0.5) / count as f64 * length_mm)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A long series of shifts, each following the one before by `follows` (0 to 1).
+    fn series(follows: f64) -> Vec<Vector3<f64>> {
+        let mut state = 11_u64;
+        let mut next = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+        };
+        let fresh = (1.0 - follows * follows).sqrt();
+        let mut at = 0.0;
+        let mut step = || {
+            at = follows * at + fresh * (0..12).map(|_| next()).sum::<f64>();
+            Vector3::new(0.0, at, 0.0)
+        };
+        (0..20_000).map(|_| step()).collect()
+    }
+
+    #[test]
+    fn shifts_that_follow_each_other_count_as_one() {
+        assert!((persistence(&series(0.0), 4) - 1.0).abs() < 0.05);
+        for follows in [0.3_f64, 0.6, 0.8] {
+            let expected = 1.0 + 2.0 * (1..=4).map(|k| follows.powi(k)).sum::<f64>();
+            assert!((persistence(&series(follows), 4) / expected - 1.0).abs() < 0.1, "{follows}");
+        }
+        assert_eq!(persistence(&[], 4), 1.0);
     }
 }

@@ -4,12 +4,15 @@
 //! After the fit, on sums of all points over short stretches of the tube, taken in one walk (`whole`). What is judged
 //! is as in `sections`: the shift, the size and the ovality of every stretch's own best section.
 
+use nalgebra::Vector3;
+
 use super::fit::Fit;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
 use super::radius::median;
 use super::section::{
-    Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, Values, cost, doubt_ovality, oval_doubt_mm, solve,
+    Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, Values, cost, doubt_ovality, oval_doubt_mm, persistence,
+    solve,
 };
 use super::whole::Whole;
 use crate::tube::Spine;
@@ -17,9 +20,23 @@ use crate::tube::Spine;
 /// Weighted products of a stretch's derivatives (five values) and the residual: the lower triangle, row by row.
 type Flat = [f64; 21];
 
+/// Stretches apart whose errors add up in an angle or a distance, and in a bend's radius. What reaches farther along shifts and
+/// turns the tube as a whole, and legs are long: it takes little part in them; an arc is short and bent by all of it.
+const NEAR: usize = 1;
+const ALONG_ARC: usize = 4;
+
+/// Factors of the variance over that of independent noise.
+#[derive(Debug, Clone, Copy)]
+pub struct Correlation {
+    /// Of all values.
+    pub near: f64,
+    /// Of the bends' radii.
+    pub along_arc: f64,
+}
+
 /// By how much the stretches scatter about the model, over what their points' noise explains: 1 for independent noise
 /// about the right tube. A median, so that a local misfit does not count.
-pub fn correlation(whole: &Whole, fit: &Fit) -> f64 {
+pub fn correlation(whole: &Whole, fit: &Fit) -> Correlation {
     let model = &fit.model;
     let spine = model.spine();
     let radius = model.tube_radius_mm;
@@ -33,9 +50,23 @@ pub fn correlation(whole: &Whole, fit: &Fit) -> f64 {
     for part in &parts {
         total.iter_mut().zip(part).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(a, b)| *a += b));
     }
-    let judged = bins.places_mm().zip(&total).filter(|(_, sums)| sums[0] >= JUDGED_POINTS);
-    let mut excess: Vec<f64> = judged.map(|(at, s)| excess(s, model, &spine, at, fit.sigma_mm)).collect();
-    (median(&mut excess).unwrap_or(0.0) / MEDIAN_CHI2).max(1.0)
+    let places = bins.places().zip(bins.places_mm()).zip(&total);
+    let judged = places.filter(|(_, sums)| sums[0] >= JUDGED_POINTS);
+    let own: Vec<Own> =
+        judged.map(|((segment, at_mm), s)| own(s, model, &spine, (segment, at_mm), fit.sigma_mm)).collect();
+    let mut excess: Vec<f64> = own.iter().map(|o| o.excess).collect();
+    let offs: Vec<Vector3<f64>> = own.iter().map(|o| o.off_mm).collect();
+    let scatter = (median(&mut excess).unwrap_or(0.0) / MEDIAN_CHI2).max(1.0);
+    let factor = |farthest| scatter * persistence(&offs, farthest);
+    Correlation { near: factor(NEAR), along_arc: factor(ALONG_ARC) }
+}
+
+/// A stretch by itself.
+struct Own {
+    /// What its own values would take off the squared residuals, over the noise's variance.
+    excess: f64,
+    /// By how much it lies off the model, across the tube.
+    off_mm: Vector3<f64>,
 }
 
 fn add(sums: &mut Flat, local: &Local, p: [f64; 3], radius_mm: f64, cutoff_mm: f64) {
@@ -59,8 +90,8 @@ fn add(sums: &mut Flat, local: &Local, p: [f64; 3], radius_mm: f64, cutoff_mm: f
     }
 }
 
-/// What the stretch's own values would take off the squared residuals, over the noise's variance.
-fn excess(sums: &Flat, model: &TubeModel, spine: &Spine, at_mm: f64, noise_mm: f64) -> f64 {
+/// The stretch whose sums these are, on a segment at an arc length.
+fn own(sums: &Flat, model: &TubeModel, spine: &Spine, (segment, at_mm): (usize, f64), noise_mm: f64) -> Own {
     let mut at = sums.iter();
     let mut full = Sums::zeros();
     for i in 0..6 {
@@ -70,5 +101,9 @@ fn excess(sums: &Flat, model: &TubeModel, spine: &Spine, at_mm: f64, noise_mm: f
     }
     doubt_ovality(&mut full, noise_mm / oval_doubt_mm(model, spine, at_mm));
     let values = solve(&full, &SPREADS.map(|spread| spread * model.tube_radius_mm), noise_mm);
-    (cost(&full, &Values::zeros()) - cost(&full, &values)) / (noise_mm * noise_mm)
+    let excess = (cost(&full, &Values::zeros()) - cost(&full, &values)) / (noise_mm * noise_mm);
+    // On an arc the first direction across is outwards.
+    let outward = if segment % 2 == 1 { -1.0 } else { 1.0 };
+    let off = Vector3::new(0.0, outward * values[1], values[2]);
+    Own { excess, off_mm: spine.frame_at(at_mm).rotation * off }
 }

@@ -74,8 +74,6 @@ pub struct Structure {
     pub prior: Option<RadiusPrior>,
     /// What the linear covariance overstates.
     pub held: Vec<Held>,
-    /// How many neighbouring sections say one thing where they differ from the tube.
-    pub persistence: f64,
     /// How it came about, and what was turned down at the end.
     pub decisions: Vec<Decision>,
 }
@@ -265,9 +263,8 @@ impl Jury {
     /// What is handed on.
     fn structure(self, model: TubeModel) -> Structure {
         let held = lengths(&self.line, &model, self.correlation, self.prior);
-        let persistence = self.line.persistence(&model);
         let (noise_mm, prior, decisions) = (self.line.noise_mm, self.prior, self.decisions);
-        Structure { noise_mm, prior, held, persistence, decisions, model }
+        Structure { noise_mm, prior, held, decisions, model }
     }
 
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
