@@ -102,3 +102,63 @@ fn follows(one: &SpinePoint, other: &SpinePoint, radius_mm: f64) -> bool {
     let turn = one.tangent.cross(&other.tangent).norm();
     aside(one) <= allowed && aside(other) <= allowed && turn <= 2.0 * bent + ASTRAY
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    const RADIUS: f64 = 10.0;
+
+    /// A point of the spine, with the misfit of a true cylinder.
+    fn on(x: f64, y: f64, direction: Vector3<f64>) -> SpinePoint {
+        SpinePoint { point: Point3::new(x, y, 0.0), tangent: direction.normalize(), rms_mm: 0.03 }
+    }
+
+    /// A straight of ten radii with a gap that a jaw hides.
+    fn held_tube() -> Vec<SpinePoint> {
+        (0..50)
+            .map(|i| 2.0 * f64::from(i))
+            .filter(|x| !(40.0..60.0).contains(x))
+            .map(|x| on(x, 0.0, Vector3::x()))
+            .collect()
+    }
+
+    #[test]
+    fn cylinders_on_a_jaws_edges_are_dropped() {
+        let mut spine = held_tube();
+        let tube = spine.len();
+        // Across the tube; along it beside it, a short stretch that fits badly; alone.
+        spine.extend([on(44.0, 14.0, Vector3::y()), on(45.0, 19.0, Vector3::y())]);
+        spine.extend(
+            (0..4).map(|i| SpinePoint { rms_mm: 0.5, ..on(46.0 + 2.0 * f64::from(i), 11.0, Vector3::x()) }),
+        );
+        spine.push(on(50.0, -25.0, Vector3::z()));
+        let kept = followed(spine, RADIUS);
+        assert_eq!(kept.len(), tube);
+        assert!(kept.iter().all(|s| s.point.y == 0.0));
+    }
+
+    #[test]
+    fn a_short_stretch_that_fits_as_well_as_the_rest_stays() {
+        let mut spine = held_tube();
+        let tube = spine.len();
+        spine.extend((0..4).map(|i| on(47.0 + 2.0 * f64::from(i), 0.0, Vector3::x())));
+        assert_eq!(followed(spine, RADIUS).len(), tube + 4);
+    }
+
+    #[test]
+    fn the_tightest_bend_is_followed() {
+        let r = TIGHTEST_RADII * RADIUS;
+        let arc = (0..30).map(|i| 0.1 * f64::from(i));
+        let bend: Vec<SpinePoint> =
+            arc.map(|t| on(r * t.sin(), r * t.cos(), Vector3::new(t.cos(), -t.sin(), 0.0))).collect();
+        assert_eq!(stretches(&bend, RADIUS).len(), 1);
+    }
+
+    #[test]
+    fn a_tube_shorter_than_any_sure_stretch_is_kept_as_it_is() {
+        let short: Vec<SpinePoint> = (0..8).map(|i| on(3.0 * f64::from(i), 0.0, Vector3::x())).collect();
+        assert_eq!(followed(short.clone(), RADIUS), short);
+    }
+}

@@ -1,8 +1,8 @@
 //! Cloud to measured tube: spine, arc-line spline, least-squares fit, uncertainty.
 //!
 //! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
-//! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, polygon by
-//! [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), how
+//! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, those that
+//! `follow` one another joined by [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs ([`arcline`], [`apollonius`]), how
 //! many bends ([`structure`], on the centre line measured in `sections`), least squares on all points, ends and sigmas
 //! ([`finish`]). Both fits descend by `fit` on normal equations that `normal` assembles from a moment per segment.
 
