@@ -86,22 +86,12 @@ impl Voxels {
         // Fixed tasks, put together in order: the same sums whatever the number of threads.
         let mut tasks: Vec<Task> =
             in_tasks(cloud.offsets()).map(|(_, points)| Task::of(&cells, points)).collect();
-        let (mut all, mut totals) = (Numbers::new(), Vec::new());
-        for task in &mut tasks {
-            for (&key, total) in task.own.keys.iter().zip(&task.totals) {
-                let number = all.number(key);
-                if number as usize == totals.len() {
-                    totals.push(Total::default());
-                }
-                totals[number as usize].add(total);
-                task.global.push(number);
-            }
-        }
-        let mut order: Vec<(u64, u32)> = all.keys.iter().map(|&key| morton(key)).zip(0..).collect();
+        let (keys, totals) = numbered(&mut tasks);
+        let mut order: Vec<(u64, u32)> = keys.iter().map(|&key| morton(key)).zip(0..).collect();
         if order.len() > TASK {
-            order.par_sort_unstable()
+            order.par_sort_unstable_by_key(|cell| cell.0)
         } else {
-            order.sort_unstable()
+            order.sort_unstable_by_key(|cell| cell.0)
         }
         Some(Voxels { tasks, totals, order: order.into_iter().map(|(_, number)| number).collect() })
     }
@@ -138,6 +128,26 @@ impl Voxels {
         }
         best
     }
+}
+
+/// Keys and totals of all tasks' voxels by the cloud's numbers, which the tasks learn.
+fn numbered(tasks: &mut [Task]) -> (Vec<u64>, Vec<Total>) {
+    if let [only] = tasks {
+        only.global = (0..only.own.keys.len() as u32).collect();
+        return (only.own.keys.clone(), only.totals.clone());
+    }
+    let (mut all, mut totals) = (Numbers::new(), Vec::new());
+    for task in tasks {
+        for (&key, total) in task.own.keys.iter().zip(&task.totals) {
+            let number = all.number(key);
+            if number as usize == totals.len() {
+                totals.push(Total::default());
+            }
+            totals[number as usize].add(total);
+            task.global.push(number);
+        }
+    }
+    (all.keys, totals)
 }
 
 impl Task {

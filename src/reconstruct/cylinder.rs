@@ -40,19 +40,20 @@ pub const REACH_RADII: f64 = 1.4;
 /// Points farther from the cylinder than this share of its radius do not count (paper 000, section 7).
 const OUTLIER_RADII: f64 = 0.1;
 
-/// Steps at most; the first ones look wide, so that a poor start can be left.
+/// Steps at most; the first one or two look wide, so that a poor start can be left: the second when the first was longer than
+/// this share of the radius.
 const STEPS: usize = 10;
 const WIDE_STEPS: usize = 2;
+const LONG_RADII: f64 = 0.03;
 
 /// A step smaller than this share of the radius is the last.
-const SETTLED_RADII: f64 = 2e-4;
+const SETTLED_RADII: f64 = 1e-3;
 
 /// Fits a cylinder to the points around a starting axis; with `free_radius` its radius too. None when the points do
 /// not determine it or the axis runs away from its start.
 pub fn fit_cylinder(points: &[Point3<f64>], start: &Cylinder, free_radius: bool) -> Option<Cylinder> {
-    let mut at = *start;
-    for step in 0..STEPS {
-        let wide = step < WIDE_STEPS;
+    let (mut at, mut wide) = (*start, true);
+    for step in 1..=STEPS {
         let outlier = at.radius_mm * if wide { 3.0 * OUTLIER_RADII } else { OUTLIER_RADII };
         let (u, v) = across(&at.axis);
         let sums = Sums::over(points, &at, (&u, &v), outlier);
@@ -82,6 +83,7 @@ pub fn fit_cylinder(points: &[Point3<f64>], start: &Cylinder, free_radius: bool)
         if !wide && change.amax() < SETTLED_RADII * scale {
             break;
         }
+        wide = step < WIDE_STEPS && change.amax() > LONG_RADII * scale;
     }
     Some(at)
 }

@@ -2,6 +2,7 @@
 //! nothing; a bend that the model lacks shows as a joint.
 
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, Matrix6x4, SymmetricEigen, Vector3, Vector4, Vector6};
+use rayon::prelude::*;
 
 use super::fit::invert;
 use super::model::{Motion, Parameter, TubeModel};
@@ -62,7 +63,7 @@ impl Solved {
         let places = line.places_mm(model);
         let columns = model.columns(parameters);
         let mut after = Downstream::empty(spine.segments().len());
-        let mut out = Vec::with_capacity(places.len());
+        let mut loose = Vec::with_capacity(places.len());
         for i in (1..self.moments.len()).rev() {
             let (segment, moment) = &self.moments[i];
             let part = Part::of(&symmetric(moment), &spine.segments()[*segment].start);
@@ -73,18 +74,18 @@ impl Solved {
                 let mut row = mixed.row_mut(column.parameter);
                 row += felt.transpose();
             }
-            let at_mm = 0.5 * (places[i - 1] + places[i]);
-            let frame = spine.frame_at(at_mm);
-            let (gain, step) = self.test(&after.all, &mixed, &frame);
-            out.push(Joint {
-                at_mm,
+            loose.push((0.5 * (places[i - 1] + places[i]), after.all.clone(), mixed));
+        }
+        let test = |(at_mm, after, mixed): &(f64, Part, DMatrix<f64>)| {
+            let (gain, step) = self.test(after, mixed, &spine.frame_at(*at_mm));
+            Joint {
+                at_mm: *at_mm,
                 gain: gain / (noise_mm * noise_mm),
                 shift_mm: step[0],
                 turn_rad: Vector3::new(step[1], step[2], step[3]),
-            });
-        }
-        out.reverse();
-        out
+            }
+        };
+        loose.par_iter().rev().map(test).collect()
     }
 
     /// Gain and best step of a joint's freedoms: shift along x and turns about x, y, z of `frame`.

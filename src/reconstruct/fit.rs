@@ -126,8 +126,9 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
     }
 }
 
-/// A step this small, in standard deviations of the estimate, is none.
-const SMALL_STEP_SIGMAS: f64 = 0.03;
+/// After a step this small, in standard deviations of the estimate, what is left is none: Newton's steps shrink by far more than
+/// the square of this.
+const LAST_STEP_SIGMAS: f64 = 0.3;
 
 /// Takes a model that is nearly there to all points: Newton's steps, cut-off and all, until what is left is nothing beside
 /// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once.
@@ -144,7 +145,7 @@ pub fn polish(data: &mut impl Data, start: &TubeModel, effort: Effort) -> Option
         let variance = pass.variance_mm2(parameters.len());
         let size = -gradient.dot(&step) / variance.max(1e-300);
         let next_cutoff_mm = (CUTOFF_SIGMAS * sigma_mm).min(cutoff_mm);
-        if size < SMALL_STEP_SIGMAS.powi(2) && next_cutoff_mm > 0.95 * cutoff_mm {
+        if size < LAST_STEP_SIGMAS.powi(2) && next_cutoff_mm > 0.95 * cutoff_mm {
             let (normal, _) = equations(&pass.moments, &model, &parameters);
             return Some(Fit {
                 covariance: invert(&normal) * variance,
@@ -152,7 +153,7 @@ pub fn polish(data: &mut impl Data, start: &TubeModel, effort: Effort) -> Option
                 used: pass.used(),
                 median_mm: pass.median_mm(cutoff_mm).unwrap_or(0.0),
                 stop: Stop::Converged,
-                model,
+                model: model.stepped(&parameters, &step),
                 parameters,
                 sigma_mm,
                 cutoff_mm,

@@ -208,6 +208,7 @@ impl Report {
 /// Finds both ends and lets the model's end straights reach them.
 fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
     sample.residuals(&fit.model);
+    let sample = &*sample;
     let spine = fit.model.spine();
     let last_segment = spine.segments().len() - 1;
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
@@ -222,8 +223,10 @@ fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
     let first_frame = first_segment.start;
     let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
     let last_frame = spine.frame_at(spine.length_mm()) * back;
-    let first = look(0, &first_frame, first_segment.length_mm);
-    let last = look(last_segment, &last_frame, end_segment.length_mm);
+    let (first, last) = rayon::join(
+        || look(0, &first_frame, first_segment.length_mm),
+        || look(last_segment, &last_frame, end_segment.length_mm),
+    );
     let model = &mut fit.model;
     if let Some(end) = last {
         model.lra.last_length_mm -= end.at_mm();

@@ -123,6 +123,11 @@ pub fn reconstruct_watched(
     }
 }
 
+/// Works on one of the pool's threads: from outside each of hundreds of short parallel loops would wait to be taken up.
+fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+    rayon::scope(|_| work())
+}
+
 /// Reconstructs with the structure by `guide`, or freely.
 fn by(
     cloud: &PointCloud,
@@ -131,7 +136,7 @@ fn by(
     begins: &mut dyn FnMut(Stage),
 ) -> Result<Reconstruction, ReconstructError> {
     begins(Stage::CentreLine);
-    let scene = scene::look(cloud, options.nominal)?;
+    let scene = in_pool(|| scene::look(cloud, options.nominal))?;
     let (radius_mm, polygon) = (scene.radius_mm, &scene.polygon);
     let sample = sample(&scene);
     let not_bent = || ReconstructError::NotBent {
@@ -140,16 +145,16 @@ fn by(
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
-    let chosen = match guide {
+    let chosen = in_pool(|| match guide {
         Some(nominal) => guided::choose(polygon, &sample, radius_mm, nominal),
         None => structure::choose(polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
-    };
+    });
     let (chosen, notes) = chosen.ok_or_else(not_bent)?;
     if moves::is_free_form(&chosen.model.lra, radius_mm) {
         return Err(not_bent());
     }
     begins(Stage::Fit);
-    let mut found = finish::finish(cloud, scene, sample, &chosen)?;
+    let mut found = in_pool(|| finish::finish(cloud, scene, sample, &chosen))?;
     found.measured.warnings.extend(notes);
     Ok(match options.nominal {
         Some(nominal) => direction::as_nominal(found, nominal),

@@ -4,9 +4,10 @@
 //! from the scanned area beforehand, so that a cloud is thinned once.
 
 use nalgebra::Point3;
+use rayon::prelude::*;
 
 use super::radius::median;
-use crate::cloud::{Neighbours, PointCloud};
+use crate::cloud::{Grid, PointCloud};
 
 /// A thinned cloud and the usual distance of its points.
 #[derive(Debug, Clone)]
@@ -82,12 +83,31 @@ fn area_mm2(probe: &PointCloud) -> f64 {
 
 /// Usual distance of neighbouring points: as if those around a place filled a disc evenly.
 fn spacing_mm(cloud: &PointCloud) -> f64 {
-    let index = Neighbours::new(cloud);
+    let diagonal = cloud.bounds().map_or(0.0, |(low, high)| (high - low).norm());
+    // Some tens of points on a surface.
+    let usual_mm = diagonal / (cloud.len().max(1) as f64).sqrt();
+    let index = Grid::new(cloud, usual_mm);
     let stride = cloud.len().div_ceil(PLACES).max(1);
-    let reach = |p: &Point3<f64>| index.nearest(p, NEIGHBOURS).last().map(|n| n.1);
+    let places = (0..cloud.len()).into_par_iter().step_by(stride);
     let mut reaches: Vec<f64> =
-        (0..cloud.len()).step_by(stride).filter_map(|i| reach(&cloud.point(i))).collect();
+        places.map(|i| reach_mm(&index, &cloud.point(i), usual_mm, diagonal)).collect();
     median(&mut reaches).unwrap_or(0.0) * (std::f64::consts::PI / NEIGHBOURS as f64).sqrt()
+}
+
+/// How far the last of the nearest few points is, the place itself among them; of all points if there are fewer.
+fn reach_mm(index: &Grid, place: &Point3<f64>, usual_mm: f64, most_mm: f64) -> f64 {
+    let mut squares = Vec::new();
+    let mut radius_mm = usual_mm;
+    loop {
+        squares.clear();
+        index.for_each_within(place, radius_mm, |_, way| squares.push(way.norm_squared()));
+        if squares.len() >= NEIGHBOURS || radius_mm >= most_mm {
+            break;
+        }
+        radius_mm *= 2.0;
+    }
+    squares.sort_unstable_by(f64::total_cmp);
+    squares.get(NEIGHBOURS - 1).or(squares.last()).map_or(0.0, |square| square.sqrt())
 }
 
 #[cfg(test)]

@@ -16,7 +16,10 @@ use super::local::{prepare, settle};
 use super::model::TubeModel;
 
 /// Points per chunk of a sum.
-pub(super) const CHUNK: usize = 4096;
+pub(super) const CHUNK: usize = 1024;
+
+/// A point this near to a segment's surface, in tube radii, is on it beyond doubt.
+const ON_SURFACE: f64 = 0.1;
 
 /// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
 pub const ROWS: usize = 9;
@@ -104,10 +107,23 @@ pub struct Sample {
 }
 
 impl Sample {
-    /// Assigns every point to the closest segment by looking at all of them.
+    /// Assigns every point to the segment on whose surface it lies, off all surfaces to the closest. The point before
+    /// is usually on the same segment.
     pub fn new(points: Vec<Point3<f64>>, model: &TubeModel) -> Sample {
-        let spine = model.spine();
-        let segment = points.par_iter().map(|p| spine.closest(p).segment as u32).collect();
+        let (spine, locals) = (model.spine(), prepare(model));
+        let radius = model.tube_radius_mm;
+        let find = |part: &[Point3<f64>]| -> Vec<u32> {
+            let mut segment = 0;
+            let one = |p: &Point3<f64>| {
+                let local = settle(p, &mut segment, &locals);
+                if locals[segment as usize].residual_mm(local.into(), radius).abs() > ON_SURFACE * radius {
+                    segment = spine.closest(p).segment as u32;
+                }
+                segment
+            };
+            part.iter().map(one).collect()
+        };
+        let segment = points.par_chunks(CHUNK).map(find).collect::<Vec<_>>().concat();
         Sample { points, segment }
     }
 

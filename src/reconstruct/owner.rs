@@ -84,15 +84,19 @@ impl Surroundings {
             let from = (at[k] - cells).floor().max(0.0) as usize;
             from..((at[k] + cells).ceil().max(0.0) as usize).min(self.size[k])
         };
+        let off = |cell: usize, k: usize| (cell as f64 + 0.5 - at[k]).powi(2);
         for z in range(2) {
             for y in range(1) {
+                let beside = off(z, 2) + off(y, 1);
+                if beside > cells * cells {
+                    continue;
+                }
+                let row = (z * self.size[1] + y) * self.size[0];
                 for x in range(0) {
-                    let off = [x as f64 + 0.5 - at.x, y as f64 + 0.5 - at.y, z as f64 + 0.5 - at.z];
-                    let square = off.iter().map(|v| v * v).sum::<f64>();
-                    let cell = (z * self.size[1] + y) * self.size[0] + x;
-                    if square <= cells * cells && square < squares[cell] {
-                        squares[cell] = square;
-                        self.nearest[cell] = index;
+                    let square = beside + off(x, 0);
+                    if square <= cells * cells && square < squares[row + x] {
+                        squares[row + x] = square;
+                        self.nearest[row + x] = index;
                     }
                 }
             }

@@ -5,6 +5,7 @@
 //! found the one that is wanted; and which points are its own ([`owner`](super::owner)).
 
 use nalgebra::Point3;
+use rayon::prelude::*;
 
 use super::crust;
 use super::error::ReconstructError;
@@ -169,7 +170,9 @@ fn tubes_of(work: &PointCloud, spine: &[SpinePoint], radius_mm: f64) -> Vec<Tube
 
 /// Points that lie on the tube's surface; None when too many around the centre line do not.
 fn on_surface(around: &Surroundings, radius_mm: f64, work: &PointCloud) -> Option<usize> {
-    let distances: Vec<f64> = work.iter().filter_map(|p| around.distance_mm(&p)).collect();
+    let distance = |i: usize| around.distance_mm(&work.point(i));
+    let distances: Vec<f64> =
+        (0..work.len()).into_par_iter().with_min_len(512).filter_map(distance).collect();
     let near = distances.iter().filter(|d| **d < 1.5 * radius_mm).count();
     let on = distances.iter().filter(|d| (**d - radius_mm).abs() < SURFACE_SHARE * radius_mm).count();
     (on as f64 >= LEAST_ON_SURFACE * near as f64).then_some(on)

@@ -7,6 +7,7 @@
 //! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
 
 use nalgebra::{Matrix5, Point3, SMatrix, Vector3, Vector5};
+use rayon::prelude::*;
 
 use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
@@ -40,6 +41,9 @@ const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
 /// Neighbouring sections are taken to follow each other no more than this.
 const MOST_FOLLOWING: f64 = 0.9;
+
+/// Points that a thread looks at in one go.
+const SEEN_TOGETHER: usize = 512;
 
 /// One short stretch of the tube.
 #[derive(Debug, Clone)]
@@ -121,11 +125,11 @@ impl CentreLine {
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
         for _ in 0..SHRINKS {
-            for (fit, seen) in fits.iter_mut().zip(&grouped) {
+            fits.par_iter_mut().zip(&grouped).for_each(|(fit, seen)| {
                 // Weighing, a section must not swing after a flying point where it sees nothing else: held more firmly
                 // than the noise asks for.
                 *fit = solve(&sums(seen, fit, cutoff), &spreads, FIRMNESS * cutoff);
-            }
+            });
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
@@ -291,34 +295,42 @@ fn moment(sums: &Sums, values: &Values, derivatives: &SMatrix<f64, VALUES, ROWS>
     let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
     // The residual falls as the values grow.
     let left = square * values - mixed;
+    // Each row of the moment moves some of the values only: twists and CLR the place across, the others one value.
+    let (across, oval) =
+        (derivatives.fixed_view::<2, OVALITY>(1, 0), derivatives.fixed_view::<2, 1>(3, OVALITY));
+    let mut seen = SMatrix::<f64, VALUES, 10>::zeros();
+    seen.fixed_columns_mut::<OVALITY>(0).copy_from(&(square.fixed_columns::<2>(1) * across));
+    seen.set_column(OVALITY, &(square.fixed_columns::<2>(3) * oval));
+    seen.set_column(TUBE_RADIUS, &square.column(0));
+    seen.set_column(RESIDUAL, &left);
     let mut out = Moment::zeros();
-    out.fixed_view_mut::<ROWS, ROWS>(0, 0).copy_from(&(derivatives.transpose() * (square * derivatives)));
-    let gradient = derivatives.transpose() * left;
-    out.fixed_view_mut::<ROWS, 1>(0, RESIDUAL).copy_from(&gradient);
-    out.fixed_view_mut::<1, ROWS>(RESIDUAL, 0).copy_from(&gradient.transpose());
+    out.fixed_rows_mut::<OVALITY>(0).copy_from(&(across.transpose() * seen.fixed_rows::<2>(1)));
+    out.set_row(OVALITY, &(oval.transpose() * seen.fixed_rows::<2>(3)));
+    out.set_row(TUBE_RADIUS, &seen.row(0));
+    out.set_row(RESIDUAL, &out.column(RESIDUAL).transpose());
     out[(RESIDUAL, RESIDUAL)] = cost(sums, values);
     out
 }
 
 /// Sums of a section's points, weighted by the biweight about its own fit.
 fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
-    let mut sums = Sums::zeros();
+    // Both triangles: more products, but in rows that the compiler turns into vector instructions.
+    let mut sums = [[0.0; VALUES + 1]; VALUES + 1];
     for point in seen {
         let row = point.row();
         let t = (point.residual_mm - row.dot(fit)) / cutoff_mm;
         let keep = 1.0 - t * t;
         if keep > 0.0 {
             let h = [row[0], row[1], row[2], row[3], row[4], point.residual_mm];
-            for column in 0..=VALUES {
-                let scaled = keep * keep * h[column];
-                for (k, value) in h.iter().enumerate().skip(column) {
-                    sums[(k, column)] += scaled * value;
+            let weighted = h.map(|v| keep * keep * v);
+            for (sums, weighted) in sums.iter_mut().zip(weighted) {
+                for (sum, value) in sums.iter_mut().zip(h) {
+                    *sum += weighted * value;
                 }
             }
         }
     }
-    sums.fill_upper_triangle_with_lower_triangle();
-    sums
+    Sums::from(sums)
 }
 
 /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
@@ -362,29 +374,32 @@ fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
     let locals = prepare(base);
     let spine = base.spine();
     let cutoff = FIRST_CUTOFF * base.tube_radius_mm;
-    let mut out = Vec::with_capacity(points.len());
-    let mut segment = 0;
-    for p in points {
-        let mut local = settle(p, &mut segment, &locals);
-        let mut off = locals[segment as usize].off_axis(&local);
-        if (off.norm() - base.tube_radius_mm).abs() > cutoff {
-            // The point before may have been on another leg.
-            segment = spine.closest(p).segment as u32;
-            local = settle(p, &mut segment, &locals);
-            off = locals[segment as usize].off_axis(&local);
-        }
-        let distance = off.norm();
-        if (distance - base.tube_radius_mm).abs() < cutoff {
+    let part = |points: &[Point3<f64>]| {
+        let mut segment = 0;
+        let one = |p: &Point3<f64>| {
+            let mut local = settle(p, &mut segment, &locals);
+            let mut off = locals[segment as usize].off_axis(&local);
+            if (off.norm() - base.tube_radius_mm).abs() > cutoff {
+                // The point before may have been on another leg.
+                segment = spine.closest(p).segment as u32;
+                local = settle(p, &mut segment, &locals);
+                off = locals[segment as usize].off_axis(&local);
+            }
+            let distance = off.norm();
+            if (distance - base.tube_radius_mm).abs() >= cutoff {
+                return None;
+            }
             let k = segment as usize;
             let along_mm = locals[k].unclamped_along_mm(&local);
             let (cos, sin) = (off.x / distance, off.y / distance);
             let round = Oval::at(cos, sin, base.tube_radius_mm, oval(base, k, along_mm));
             let residual_mm = distance - round.radius_mm;
             let section = bins.of(k, along_mm / locals[k].length_mm.max(1e-12)) as u32;
-            out.push(Seen { section, along_mm, cos, sin, residual_mm });
-        }
-    }
-    out
+            Some(Seen { section, along_mm, cos, sin, residual_mm })
+        };
+        points.iter().filter_map(one).collect::<Vec<Seen>>()
+    };
+    points.par_chunks(SEEN_TOGETHER).map(part).collect::<Vec<_>>().concat()
 }
 
 /// Points by their section.

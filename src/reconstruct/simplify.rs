@@ -1,6 +1,8 @@
 //! Polygon simplification: the fewest vertices within a tolerance, and of all such polygons the one with the
 //! smallest squared error (paper 000, section 4.5; shortcut graph after D. Eu and G. Toussaint 1994).
 
+use std::ops::RangeInclusive;
+
 use nalgebra::{Matrix3, Point3, Vector3};
 
 /// Sums over the first k points, for squared errors of any chord in constant time.
@@ -50,9 +52,14 @@ pub fn simplify(points: &[Point3<f64>], tolerance_mm: f64) -> Vec<usize> {
     (edges[0], error[0]) = (0, 0.0);
     for i in 0..n - 1 {
         for j in i + 1..n {
-            let (count, squared) = (edges[i] + 1, error[i] + prefix.squared_error(points, i, j));
+            let count = edges[i] + 1;
+            // The middle is where a chord usually fails, and costs least.
+            if count > edges[j] || !within(points, i, j, (i + j) / 2..=(i + j) / 2, tolerance_mm) {
+                continue;
+            }
+            let squared = error[i] + prefix.squared_error(points, i, j);
             let better = count < edges[j] || (count == edges[j] && squared < error[j]);
-            if better && within(points, i, j, tolerance_mm) {
+            if better && within(points, i, j, i..=j, tolerance_mm) {
                 (edges[j], error[j], before[j]) = (count, squared, i);
             }
         }
@@ -65,17 +72,21 @@ pub fn simplify(points: &[Point3<f64>], tolerance_mm: f64) -> Vec<usize> {
     kept
 }
 
-/// Whether all points between lie within the tolerance of the chord (as a segment).
-fn within(points: &[Point3<f64>], i: usize, j: usize, tolerance_mm: f64) -> bool {
+/// Whether the points `among` those between lie within the tolerance of the chord (as a segment).
+fn within(
+    points: &[Point3<f64>],
+    i: usize,
+    j: usize,
+    among: RangeInclusive<usize>,
+    tolerance_mm: f64,
+) -> bool {
     let chord = points[j] - points[i];
     let length = chord.norm_squared().max(1e-300);
-    let near = |p: &Point3<f64>| {
+    points[among].iter().all(|p| {
         let from = p - points[i];
         let t = (from.dot(&chord) / length).clamp(0.0, 1.0);
         (from - chord * t).norm_squared() <= tolerance_mm * tolerance_mm
-    };
-    // The middle is where a chord usually fails.
-    near(&points[(i + j) / 2]) && points[i + 1..j].iter().all(near)
+    })
 }
 
 #[cfg(test)]
@@ -91,7 +102,7 @@ mod tests {
         for mask in 0u32..1 << (n - 2) {
             let kept: Vec<usize> =
                 (0..n).filter(|&k| k == 0 || k == n - 1 || mask & (1 << (k - 1)) != 0).collect();
-            if kept.windows(2).all(|w| within(points, w[0], w[1], tolerance)) {
+            if kept.windows(2).all(|w| within(points, w[0], w[1], w[0]..=w[1], tolerance)) {
                 let error: f64 = kept.windows(2).map(|w| prefix.squared_error(points, w[0], w[1])).sum();
                 if kept.len() < best.0 || (kept.len() == best.0 && error < best.1) {
                     best = (kept.len(), error);

@@ -31,6 +31,9 @@ pub const MOST_BENDS: usize = 40;
 /// A change must gain this much, or rounding could turn it back for ever.
 const LEAST_GAIN: f64 = 1e-6;
 
+/// Candidates whose scores differ by less are one: about what a fit leaves unresolved.
+const SAME_SCORE: f64 = 0.01;
+
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
 
@@ -105,9 +108,12 @@ pub fn choose(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64) -
         decisions: Vec::new(),
     };
     let starts: Vec<TubeModel> =
-        TOLERANCES.iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
-    let rough: Vec<Candidate> = starts.iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
-    let first = rough.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
+        TOLERANCES.par_iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
+    let mut rough: Vec<Candidate> =
+        starts.par_iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
+    rough.sort_by(|a, b| a.score.total_cmp(&b.score));
+    rough.dedup_by(|b, a| b.score - a.score < SAME_SCORE && b.parameters.len() == a.parameters.len());
+    let first = rough.first()?;
     jury.line = CentreLine::measure(sample, &first.model, false);
     let fitted: Vec<Candidate> =
         rough.par_iter().map(|c| jury.fit(&c.model, FULL_STEPS, f64::INFINITY)).collect();
