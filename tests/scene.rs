@@ -240,7 +240,7 @@ fn thousands_of_pieces_are_joined_in_little_time() {
     let mut next = numbers(4);
     let mut any = || {
         let tangent = Vector3::new(next() - 0.5, next() - 0.5, next() - 0.5).normalize();
-        SpinePoint { point: Point3::new(next(), next(), next()) * 300.0, tangent }
+        SpinePoint { point: Point3::new(next(), next(), next()) * 300.0, tangent, rms_mm: 0.0 }
     };
     let points: Vec<SpinePoint> = (0..5_000).map(|_| any()).collect();
     let started = Instant::now();
