@@ -115,11 +115,11 @@ mod tests {
         SpinePoint { point: Point3::new(x, y, 0.0), tangent: direction.normalize(), rms_mm: 0.03 }
     }
 
-    /// A straight of ten radii with a gap that a jaw hides.
+    /// A straight of sixteen radii with a gap that a jaw hides.
     fn held_tube() -> Vec<SpinePoint> {
-        (0..50)
+        (0..80)
             .map(|i| 2.0 * f64::from(i))
-            .filter(|x| !(40.0..60.0).contains(x))
+            .filter(|x| !(60.0..80.0).contains(x))
             .map(|x| on(x, 0.0, Vector3::x()))
             .collect()
     }
@@ -129,11 +129,11 @@ mod tests {
         let mut spine = held_tube();
         let tube = spine.len();
         // Across the tube; along it beside it, a short stretch that fits badly; alone.
-        spine.extend([on(44.0, 14.0, Vector3::y()), on(45.0, 19.0, Vector3::y())]);
+        spine.extend([on(64.0, 14.0, Vector3::y()), on(65.0, 19.0, Vector3::y())]);
         spine.extend(
-            (0..4).map(|i| SpinePoint { rms_mm: 0.5, ..on(46.0 + 2.0 * f64::from(i), 11.0, Vector3::x()) }),
+            (0..4).map(|i| SpinePoint { rms_mm: 0.5, ..on(66.0 + 2.0 * f64::from(i), 11.0, Vector3::x()) }),
         );
-        spine.push(on(50.0, -25.0, Vector3::z()));
+        spine.push(on(70.0, -25.0, Vector3::z()));
         let kept = followed(spine, RADIUS);
         assert_eq!(kept.len(), tube);
         assert!(kept.iter().all(|s| s.point.y == 0.0));
@@ -143,7 +143,7 @@ mod tests {
     fn a_short_stretch_that_fits_as_well_as_the_rest_stays() {
         let mut spine = held_tube();
         let tube = spine.len();
-        spine.extend((0..4).map(|i| on(47.0 + 2.0 * f64::from(i), 0.0, Vector3::x())));
+        spine.extend((0..4).map(|i| on(67.0 + 2.0 * f64::from(i), 0.0, Vector3::x())));
         assert_eq!(followed(spine, RADIUS).len(), tube + 4);
     }
 
