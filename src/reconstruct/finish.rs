@@ -1,7 +1,7 @@
 //! The last part of the reconstruction: the structure that a sample has shown, fitted to all points and measured.
 //!
-//! After `structure`, which leaves the fit near its end: one step on all points takes it there, another pass the rest of the way.
-//! All passes are walks over the cloud as it lies in memory (`whole`).
+//! After `structure`, which leaves the fit near its end: one step on all points takes it there, another pass
+//! the rest of the way. All passes are walks over the cloud as it lies in memory (`whole`).
 
 use nalgebra::Point3;
 

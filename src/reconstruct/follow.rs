@@ -46,7 +46,7 @@ pub fn followed(spine: Vec<SpinePoint>, radius_mm: f64) -> Vec<SpinePoint> {
 /// Points that follow one another.
 struct Stretch {
     members: Vec<usize>,
-    /// Greatest distance from its first point, twice over at most.
+    /// Distance of its two ends, about.
     extent_mm: f64,
     /// Median distance of the scan's points from the cylinders.
     misfit_mm: f64,

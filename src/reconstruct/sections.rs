@@ -182,7 +182,8 @@ impl CentreLine {
 
     /// How many neighbouring sections say one thing where they differ from the model: 1 when each lies off to a side of
     /// its own. From how often neighbours lie off to the same side, so that a local misfit counts little; as if each
-    /// followed the one before (first-order autoregression).
+    /// followed the one before (first-order autoregression). The sigmas sum correlations instead (`section::persistence`); here
+    /// that would take slow drift for what bends compete with, and true bends were lost.
     fn persistence(&self, model: &TubeModel) -> f64 {
         let mut offs: Vec<Vector3<f64>> = Vec::new();
         self.walk(model, |section, _, values, _| {
