@@ -205,8 +205,9 @@ pub struct Way {
 const PATIENCE: usize = 8;
 const HOPE: f64 = 10.0;
 
-/// Damping of the first step, of one that is as good as undamped, and from which on no step will help.
-const FIRST_DAMPING: f64 = 1e-6;
+/// Damping of a step that is as good as undamped, which the first is: beside shallow bends the weakest directions have a
+/// curvature of 1e-11 (rotations that undo each other), and any more damping would leave them as they are. And damping from
+/// which on no step will help.
 const NO_DAMPING: f64 = 1e-12;
 const MOST_DAMPING: f64 = 1e6;
 
@@ -228,7 +229,7 @@ pub fn descend(
     let mut model = start;
     let mut pass = data.pass(&model, way.cutoff_mm);
     let mut cost = total(&model, &pass);
-    let (mut passes, mut damping) = (1, FIRST_DAMPING);
+    let (mut passes, mut damping) = (1, NO_DAMPING);
     for taken in 0..way.steps {
         let (normal, gradient) = full_equations(&model, &pass, parameters, &prior, way.noise_mm);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
