@@ -13,7 +13,8 @@ use benderd::cell::measure;
 use benderd::cloud::{PlyForm, PointCloud, Unit, read_scan, write_ply_as};
 use benderd::config::{Materials, load_part};
 use benderd::reconstruct::finish::finish;
-use benderd::reconstruct::{Options, reconstruct, sample, scene, structure};
+use benderd::reconstruct::structure::{self, Shown};
+use benderd::reconstruct::{Options, reconstruct, sample, scene};
 use benderd::sim::scan::{Density, ScanSettings, TubeShape, scan};
 
 /// Points of the scans: the paper's, and more.
@@ -39,7 +40,8 @@ fn stages(criterion: &mut Criterion, points: usize) -> anyhow::Result<()> {
     let cloud: PointCloud = read_scan(&path, Unit::Millimetre)?.cloud;
     let seen = scene::look(&cloud, None)?;
     let thin = sample(&seen);
-    let choose = || structure::choose(&seen.polygon, &thin, seen.radius_mm);
+    let shown = Shown::new(&cloud, &seen, &thin);
+    let choose = || structure::choose(&shown);
     let chosen = choose().context("no structure")?;
     let mut group = criterion.benchmark_group("reconstruct");
     group.sample_size(10).sampling_mode(SamplingMode::Flat);

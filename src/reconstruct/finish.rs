@@ -93,7 +93,7 @@ fn finish_as_chosen(
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
     // Sigmas by what the points say together, not by their number.
-    best.covariance = profile::tightened(&best.covariance, &best.parameters, &chosen.held);
+    best.covariance = profile::tightened(&best.information, &best.parameters, &chosen.held);
     let correlation = correlation(&whole, &best);
     best.covariance *= correlation.near;
     let mut ends = end_points(&whole, sample, &best);
@@ -115,7 +115,7 @@ fn finish_as_chosen(
 fn fit_to_all(whole: &mut Whole, chosen: &Structure) -> Fit {
     let cutoff_mm = CUTOFF_SIGMAS * chosen.noise_mm;
     let effort = Effort { cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior };
-    polish(whole, &chosen.model, effort).unwrap_or_else(|| fit(whole, &chosen.model, effort))
+    polish(whole, &chosen.model, effort, &chosen.held).unwrap_or_else(|| fit(whole, &chosen.model, effort))
 }
 
 /// The points that show the tube's ends.

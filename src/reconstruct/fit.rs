@@ -33,7 +33,9 @@ pub struct Fit {
     pub model: TubeModel,
     /// Its free values.
     pub parameters: Vec<Parameter>,
-    /// Inverse of the normal matrix times the residual variance, in the order of `parameters`.
+    /// Normal matrix over the residual variance, in the order of `parameters`.
+    pub information: DMatrix<f64>,
+    /// Its inverse.
     pub covariance: DMatrix<f64>,
     /// Robust standard deviation of the residuals.
     pub sigma_mm: f64,
@@ -111,7 +113,7 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
     }
     let sigma_mm = robust_sigma(&state.pass, cutoff);
     let (normal, _) = equations(&state.pass.moments, &state.model, &parameters);
-    let covariance = invert(&normal) * state.pass.variance_mm2(parameters.len());
+    let information = normal / state.pass.variance_mm2(parameters.len());
     Fit {
         cost: state.pass.cost,
         used: state.pass.used(),
@@ -119,7 +121,8 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
         model: state.model,
         stop: state.stop,
         parameters,
-        covariance,
+        covariance: invert(&information),
+        information,
         sigma_mm,
         cutoff_mm: cutoff,
         passes,
@@ -131,24 +134,36 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
 const LAST_STEP_SIGMAS: f64 = 0.3;
 
 /// Takes a model that is nearly there to all points: Newton's steps, cut-off and all, until what is left is nothing beside
-/// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once.
-pub fn polish(data: &mut impl Data, start: &TubeModel, effort: Effort) -> Option<Fit> {
+/// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once or lead astray. Values that
+/// the linear equations leave open are kept within their own standard deviations (`held`).
+pub fn polish(
+    data: &mut impl Data,
+    start: &TubeModel,
+    effort: Effort,
+    held: &[(Parameter, f64)],
+) -> Option<Fit> {
     let parameters = start.parameters();
     let mut model = start.clone();
     let mut cutoff_mm = effort.cutoff_mm;
-    let mut before = f64::INFINITY;
+    let (mut before, mut cost) = (f64::INFINITY, f64::INFINITY);
     for passes in 1..=effort.steps {
         let pass = data.pass(&model, cutoff_mm);
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
-        let (normal, gradient) = full_equations(&model, &pass, &parameters, &effort.prior, sigma_mm);
+        let (mut normal, gradient) = full_equations(&model, &pass, &parameters, &effort.prior, sigma_mm);
+        for (parameter, spread) in held {
+            let at = parameters.iter().position(|p| p == parameter);
+            at.into_iter().for_each(|j| normal[(j, j)] += (sigma_mm / spread).powi(2));
+        }
         let step = damped_step(&normal, &gradient, 1e-12)? * pass.shortfall();
         let variance = pass.variance_mm2(parameters.len());
         let size = -gradient.dot(&step) / variance.max(1e-300);
         let next_cutoff_mm = (CUTOFF_SIGMAS * sigma_mm).min(cutoff_mm);
         if size < LAST_STEP_SIGMAS.powi(2) && next_cutoff_mm > 0.95 * cutoff_mm {
             let (normal, _) = equations(&pass.moments, &model, &parameters);
+            let information = normal / variance;
             return Some(Fit {
-                covariance: invert(&normal) * variance,
+                covariance: invert(&information),
+                information,
                 cost: pass.cost,
                 used: pass.used(),
                 median_mm: pass.median_mm(cutoff_mm).unwrap_or(0.0),
@@ -160,10 +175,10 @@ pub fn polish(data: &mut impl Data, start: &TubeModel, effort: Effort) -> Option
                 passes,
             });
         }
-        if size > 0.5 * before {
+        if size > 0.5 * before || pass.cost > cost {
             return None;
         }
-        before = size;
+        (before, cost) = (size, pass.cost);
         cutoff_mm = next_cutoff_mm;
         model = model.stepped(&parameters, &step);
     }

@@ -18,7 +18,7 @@ use super::moves::{with_common_radius, without_bend};
 use super::places::{Course, SHALLOW_RAD, lay};
 use super::profile::lengths;
 use super::sections::CentreLine;
-use super::structure::{self, Structure};
+use super::structure::{self, Shown, Structure};
 use crate::tube::{Lra, Nominal};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
@@ -58,13 +58,9 @@ const SAME_ANGLE_RAD: f64 = 0.05 * DEGREE;
 pub type Chosen = (Structure, Vec<String>);
 
 /// Finds the structure by the nominal, or freely where that explains the scan better. None when neither does.
-pub fn choose(
-    polygon: &[Point3<f64>],
-    sample: &[Point3<f64>],
-    radius_mm: f64,
-    nominal: &Nominal,
-) -> Option<Chosen> {
-    let free = || structure::choose(polygon, sample, radius_mm);
+pub fn choose(shown: &Shown, nominal: &Nominal) -> Option<Chosen> {
+    let Shown { polygon, sample, radius_mm, .. } = *shown;
+    let free = || structure::choose(shown);
     let part = nominal.lra.merged();
     let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
         return free().map(|s| (s, Vec::new()));

@@ -32,10 +32,12 @@ mod moves;
 mod normal;
 mod outline;
 pub mod owner;
+mod passes;
 mod places;
 mod profile;
 pub mod radius;
 pub mod scene;
+mod search;
 #[cfg(test)]
 mod search_tests;
 mod section;
@@ -52,6 +54,7 @@ use crate::cloud::PointCloud;
 use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
 use model::TubeModel;
 use scene::Scene;
+use structure::Shown;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -145,9 +148,10 @@ fn by(
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
+    let shown = Shown::new(cloud, &scene, &sample);
     let chosen = in_pool(|| match guide {
-        Some(nominal) => guided::choose(polygon, &sample, radius_mm, nominal),
-        None => structure::choose(polygon, &sample, radius_mm).map(|s| (s, Vec::new())),
+        Some(nominal) => guided::choose(&shown, nominal),
+        None => structure::choose(&shown).map(|s| (s, Vec::new())),
     });
     let (chosen, notes) = chosen.ok_or_else(not_bent)?;
     if moves::is_free_form(&chosen.model.lra, radius_mm) {

@@ -7,7 +7,7 @@
 use nalgebra::DMatrix;
 
 use super::evidence::Solved;
-use super::fit::{RadiusPrior, Way, descend};
+use super::fit::{RadiusPrior, Way, descend, invert};
 use super::model::{Parameter, TubeModel};
 use super::sections::CentreLine;
 
@@ -73,19 +73,21 @@ pub fn lengths(
     found.map(spread).collect()
 }
 
-/// The covariance with what was found of single values: as if each had been measured once more, so that its own standard
-/// deviation becomes the one found.
-pub fn tightened(covariance: &DMatrix<f64>, parameters: &[Parameter], held: &[Held]) -> DMatrix<f64> {
-    let mut out = covariance.clone();
+/// The covariance of this information with what was found of single values: as if each had been measured once more, so that
+/// its own standard deviation becomes the one found. On the information, since a value that the linear covariance leaves
+/// open altogether has nothing to be subtracted from.
+pub fn tightened(information: &DMatrix<f64>, parameters: &[Parameter], held: &[Held]) -> DMatrix<f64> {
+    let mut information = information.clone();
+    let mut covariance = invert(&information);
     for (parameter, sigma) in held {
         let Some(j) = parameters.iter().position(|p| p == parameter) else { continue };
-        let (own, wanted) = (out[(j, j)], sigma * sigma);
+        let (own, wanted) = (covariance[(j, j)], sigma * sigma);
         if own > wanted {
-            let column = out.column(j).into_owned();
-            out -= &column * column.transpose() * ((1.0 - wanted / own) / own);
+            information[(j, j)] += 1.0 / wanted - 1.0 / own;
+            covariance = invert(&information);
         }
     }
-    out
+    covariance
 }
 
 #[cfg(test)]
@@ -95,13 +97,22 @@ mod tests {
     #[test]
     fn a_value_held_takes_its_partners_along() {
         // Two values that differ surely by nothing, both unsure: holding one holds the other.
-        let covariance = DMatrix::from_row_slice(2, 2, &[4.0, 4.0, 4.0, 4.01]);
+        let information = invert(&DMatrix::from_row_slice(2, 2, &[4.0, 4.0, 4.0, 4.01]));
         let parameters = [Parameter::Length(1), Parameter::Angle(1)];
-        let held = tightened(&covariance, &parameters, &[(Parameter::Length(1), 0.1)]);
-        assert!((held[(0, 0)] - 0.01).abs() < 1e-12);
-        assert!((held[(1, 1)] - 0.02).abs() < 1e-12);
+        let held = tightened(&information, &parameters, &[(Parameter::Length(1), 0.1)]);
+        assert!((held[(0, 0)] - 0.01).abs() < 1e-9);
+        assert!((held[(1, 1)] - 0.02).abs() < 1e-9);
         // A wider one changes nothing.
-        let same = tightened(&covariance, &parameters, &[(Parameter::Length(1), 3.0)]);
-        assert_eq!(same, covariance);
+        let same = tightened(&information, &parameters, &[(Parameter::Length(1), 3.0)]);
+        assert_eq!(same, invert(&information));
+    }
+
+    #[test]
+    fn a_value_that_was_open_altogether_is_held_too() {
+        // Only the difference is known, as of two bends the other way with nothing between.
+        let information = DMatrix::from_row_slice(2, 2, &[1e6, -1e6, -1e6, 1e6]);
+        let parameters = [Parameter::Length(1), Parameter::Angle(1)];
+        let held = tightened(&information, &parameters, &[(Parameter::Length(1), 0.5)]);
+        assert!((held[(0, 0)] - 0.25).abs() < 1e-3 && (held[(1, 1)] - 0.25).abs() < 1e-3, "{held}");
     }
 }

@@ -101,6 +101,8 @@ pub struct Bins {
     segments: Vec<(usize, usize, f64, f64)>,
     /// Sections of the whole tube.
     pub total: usize,
+    /// How long a section is at most.
+    pub length_mm: f64,
 }
 
 impl Bins {
@@ -108,7 +110,7 @@ impl Bins {
     pub fn new(spine: &Spine, radius_mm: f64, points: usize) -> Bins {
         let per_radius = points as f64 * radius_mm / spine.length_mm().max(1e-9);
         let length_mm = (ENOUGH_POINTS / per_radius).clamp(SECTION_RADII, LONGEST_RADII) * radius_mm;
-        let mut bins = Bins { segments: Vec::new(), total: 0 };
+        let mut bins = Bins { segments: Vec::new(), total: 0, length_mm };
         for segment in spine.segments() {
             let count = (segment.length_mm / length_mm).ceil().max(1.0) as usize;
             bins.segments.push((bins.total, count, segment.start_mm, segment.length_mm));

@@ -71,6 +71,9 @@ pub struct CentreLine {
     pub noise_mm: f64,
     /// Weight of all points.
     pub count: f64,
+    /// Where sections were left out because something else was scanned there, and how far around.
+    crowded: Vec<Point3<f64>>,
+    reach_mm: f64,
 }
 
 /// A point as its section sees it.
@@ -111,7 +114,9 @@ impl CentreLine {
             }
         };
         let sections: Vec<Section> = (0..polygon.len()).map(section).collect();
-        CentreLine { count: sections.len() as f64, sections, radius_mm, noise_mm: 0.01 * radius_mm }
+        let count = sections.len() as f64;
+        let (crowded, reach_mm) = (Vec::new(), 0.0);
+        CentreLine { sections, radius_mm, noise_mm: 0.01 * radius_mm, count, crowded, reach_mm }
     }
 
     /// Measures the sections of a tube that lies near `base`: one that the polygon gave, or one that was fitted.
@@ -133,17 +138,21 @@ impl CentreLine {
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
-        let mut sections = Vec::new();
+        let (mut sections, mut crowded) = (Vec::new(), Vec::new());
         for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
             let mut sums = sums(seen, fit, cutoff);
             let count = sums[(0, 0)];
-            // Before the first fit the radius is a guess: all points may look like strangers.
-            if count < 1.0 || (fitted && is_crowded(seen, fit, cutoff)) {
+            if count < 1.0 {
                 continue;
             }
             let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
             let segment = &spine.segments()[place];
             let frame = segment.frame_at(along);
+            // Before the first fit the radius is a guess: all points may look like strangers.
+            if fitted && is_crowded(seen, fit, cutoff) {
+                crowded.push(frame.translation.vector.into());
+                continue;
+            }
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
             let oval_mm = [oval(base, place, along), 0.0];
             doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, segment.start_mm + along));
@@ -159,7 +168,25 @@ impl CentreLine {
             });
         }
         let count = sections.iter().map(|s| s.count).sum();
-        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count }
+        let reach_mm = base.tube_radius_mm.hypot(0.5 * bins.length_mm);
+        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded, reach_mm }
+    }
+
+    /// Whether a point lies where something else was scanned with the tube.
+    pub fn is_crowded_at(&self, p: &Point3<f64>) -> bool {
+        self.crowded.iter().any(|c| (p - c).norm_squared() < self.reach_mm * self.reach_mm)
+    }
+
+    /// The farthest that two tubes lie apart across the centre line.
+    pub fn apart_mm(&self, one: &TubeModel, other: &TubeModel) -> f64 {
+        let mut places = Vec::with_capacity(self.sections.len());
+        self.walk(one, |_, _, values, _| places.push((values[1], values[2])));
+        let (mut most, mut i) = (0.0_f64, 0);
+        self.walk(other, |_, _, values, _| {
+            most = most.max((values[1] - places[i].0).hypot(values[2] - places[i].1));
+            i += 1;
+        });
+        most
     }
 
     /// Places at which a bend could be.

@@ -53,6 +53,21 @@ impl<'a> Whole<'a> {
         self.own.map_or(self.cloud.len(), <[u32]>::len)
     }
 
+    /// Indices of at most about so many of the points, in runs of `run` as they lie in the file.
+    pub fn runs(&self, run: usize, most: usize) -> Vec<u32> {
+        let every = self.len().div_ceil(most).max(1);
+        let kept = (0..self.len()).filter(|i| (i / run).is_multiple_of(every));
+        kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+    }
+
+    /// Those of the cloud's points that have these indices.
+    pub fn only<'b>(&self, indices: &'b [u32]) -> Whole<'b>
+    where
+        'a: 'b,
+    {
+        Whole { cloud: self.cloud, own: Some(indices) }
+    }
+
     /// Walks all points. Each is given to `add` with its segment and its place in that segment's frame; one `new` per
     /// chunk, in order.
     pub fn walk<S: Send>(

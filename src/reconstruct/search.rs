@@ -1,0 +1,279 @@
+//! The search for the structure: the best tube so far changed by one bend at a time (dropped, merged, split, put in) as
+//! long as the measured centre line is better explained per value spent (Bayesian information criterion), then by one bend
+//! taken from one place to another, then with what looked like error taken for a bend.
+//!
+//! Under `structure`, which gives it the tubes to begin with.
+
+use rayon::prelude::*;
+
+use super::evidence::{Joint, Solved};
+use super::fit::{Descent, RadiusPrior, Way, descend};
+use super::model::{Parameter, TubeModel};
+use super::moves::{doubled, likeliest_pairs, merged, split, with_bend, without_bend};
+use super::sections::CentreLine;
+use crate::tube::Decision;
+
+/// More bends than this are a coil or a hose, not a bent tube.
+pub const MOST_BENDS: usize = 40;
+
+/// A change must gain this much, or rounding could turn it back for ever.
+const LEAST_GAIN: f64 = 1e-6;
+
+/// A value this many times less certain than what it costs would still be spent is tried without.
+pub(super) const DOUBT: f64 = 4.0;
+
+/// Changes turned down at the end that are remembered.
+const REMEMBERED: usize = 5;
+
+/// Gain of a joint, per independent point, that makes a bend be tried there.
+const JOINT_GAIN: f64 = 30.0;
+
+/// Joints tried per round, and rounds.
+const JOINTS: usize = 3;
+const ROUNDS: usize = 20;
+
+/// Bends that are tried elsewhere, and how many bends' price taking one out may cost.
+const MOVED: usize = 3;
+const DEAREST_BENDS: f64 = 8.0;
+
+/// A joint that takes away such a share of all misfit is looked into, however large the misfit.
+const EXPLAINED: f64 = 0.2;
+
+/// A bend must move the tube by this many times what the passes lie apart: of passes 20 to 80 micrometres apart the bends that
+/// were none moved it by 1.1 to 2.5 times that, true ones by 3 and more.
+const ABOVE_PASSES: f64 = 2.5;
+
+/// Steps of a fit, and of one that only has to show whether a change is worth it.
+pub(super) const FULL_STEPS: usize = 100;
+const TRIAL_STEPS: usize = 40;
+
+/// A fitted structure.
+#[derive(Debug, Clone)]
+pub(super) struct Candidate {
+    /// The tube.
+    pub model: TubeModel,
+    /// Its free values.
+    pub parameters: Vec<Parameter>,
+    /// Information criterion: smaller is better.
+    pub score: f64,
+}
+
+impl Candidate {
+    pub(super) fn bends(&self) -> usize {
+        self.model.lra.bends.len()
+    }
+}
+
+/// The data and what all candidates share.
+pub(super) struct Jury {
+    pub line: CentreLine,
+    /// How many points say one thing.
+    pub correlation: f64,
+    pub prior: Option<RadiusPrior>,
+    pub decisions: Vec<Decision>,
+}
+
+/// A change to be tried.
+struct Change {
+    /// In words.
+    what: String,
+    /// The bend of the tube as it is, counted from 0.
+    bend: Option<usize>,
+    model: TubeModel,
+}
+
+impl Jury {
+    /// Fits a model to the sections; given up when it cannot score below `goal`.
+    pub(super) fn fit(&self, model: &TubeModel, steps: usize, goal: f64) -> Candidate {
+        let parameters = model.parameters();
+        let noise_mm = self.line.noise_mm;
+        let worth = (goal - self.price(parameters.len(), model.lra.bends.len()))
+            * self.correlation
+            * noise_mm
+            * noise_mm
+            / 2.0;
+        let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth };
+        let descent = descend(&mut self.line.clone(), model.clone(), &parameters, self.prior, way);
+        self.scored(descent, parameters)
+    }
+
+    /// Scores a model as it is.
+    pub(super) fn judge(&self, model: TubeModel) -> Candidate {
+        self.fit(&model, 0, f64::INFINITY)
+    }
+
+    pub(super) fn scored(&self, descent: Descent, parameters: Vec<Parameter>) -> Candidate {
+        let noise_mm = self.line.noise_mm;
+        let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / self.correlation;
+        let score = misfit + self.price(parameters.len(), descent.model.lra.bends.len());
+        Candidate { model: descent.model, parameters, score }
+    }
+
+    /// What a number of values costs; and each bend, that its place is the best of so many (extended information
+    /// criterion, J. Chen and Z. Chen, Biometrika 2008).
+    pub(super) fn price(&self, parameters: usize, bends: usize) -> f64 {
+        let places = (self.line.places() as f64).max(1.0);
+        parameters as f64 * (self.line.count / self.correlation).max(2.0).ln()
+            + 2.0 * bends as f64 * places.ln()
+    }
+
+    pub(super) fn decide(&mut self, what: String, bend: Option<usize>, gain: f64, kept: bool) {
+        self.decisions.push(Decision { what, bend: bend.map(|i| i + 1), gain, kept });
+    }
+
+    /// Changes the best candidate as long as it gets better. Of the changes turned down in the last round the likeliest
+    /// are remembered.
+    pub(super) fn search(&mut self, mut best: Candidate) -> Candidate {
+        for _ in 0..ROUNDS {
+            let mut tried = self.tried(&best);
+            tried.sort_by(|a, b| a.1.score.total_cmp(&b.1.score));
+            let better = tried.first().is_some_and(|(_, c)| c.score < best.score - LEAST_GAIN);
+            if better {
+                let (change, candidate) = tried.swap_remove(0);
+                self.decide(change.what, None, best.score - candidate.score, true);
+                best = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
+            } else if let Some(other) = self.moved(&best, &tried).or_else(|| self.explained(&best)) {
+                best = other;
+            } else {
+                self.decisions.retain(|d| d.kept);
+                for (change, candidate) in tried.into_iter().take(REMEMBERED) {
+                    self.decide(change.what, change.bend, best.score - candidate.score, false);
+                }
+                break;
+            }
+        }
+        best
+    }
+
+    /// The best candidate with one bend taken out and one put in elsewhere, if that is better: two shallow bends of which
+    /// one has taken the other's part are no step of one bend away from right.
+    fn moved(&mut self, best: &Candidate, tried: &[(Change, Candidate)]) -> Option<Candidate> {
+        let dearest = best.score + DEAREST_BENDS * self.price(5, 1);
+        let fewer = tried.iter().filter(|(_, c)| c.bends() < best.bends() && c.score < dearest);
+        let mut changes = Vec::new();
+        for (change, candidate) in fewer.take(MOVED) {
+            let less = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
+            let more = self.changes(&less).into_iter().filter(|c| c.model.lra.bends.len() >= best.bends());
+            changes.extend(more.map(|m| (format!("{}, and {}", change.what, m.what), m.model)));
+        }
+        let fit = |(what, model)| (what, self.fit(&model, FULL_STEPS, best.score));
+        let fitted: Vec<(String, Candidate)> = changes.into_par_iter().map(fit).collect();
+        let (what, candidate) = fitted.into_iter().min_by(|a, b| a.1.score.total_cmp(&b.1.score))?;
+        let gain = best.score - candidate.score;
+        if gain < LEAST_GAIN {
+            return None;
+        }
+        self.decide(what, None, gain, true);
+        Some(candidate)
+    }
+
+    /// What looks like error that neighbours share may be a bend that is missing. Where one more takes much of it away, both
+    /// are judged by what that one leaves.
+    fn explained(&mut self, best: &Candidate) -> Option<Candidate> {
+        let solved = Solved::new(&self.line, &best.model, &best.parameters);
+        let joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
+        let joint = joints.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain))?;
+        let misfit = (best.score - self.price(best.parameters.len(), best.bends())) * self.correlation;
+        if joint.gain < EXPLAINED * misfit {
+            return None;
+        }
+        let more = [with_bend(&best.model, &joint), split(&best.model, &joint)].concat();
+        let fitted: Vec<Candidate> =
+            more.par_iter().map(|m| self.fit(m, FULL_STEPS, f64::INFINITY)).collect();
+        let more = fitted.into_iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
+        let before = self.correlation;
+        self.correlation = self.line.correlation(&more.model).min(before);
+        let (less, more) = (self.judge(best.model.clone()), self.judge(more.model));
+        let gain = less.score - more.score;
+        if gain < LEAST_GAIN {
+            self.correlation = before;
+            return None;
+        }
+        self.decide(format!("a bend put in at {:.0} mm", joint.at_mm), None, gain, true);
+        Some(more)
+    }
+
+    /// The tube without the bends that move it by no more than its scan's passes disagree.
+    pub(super) fn material(&mut self, mut best: Candidate, passes_mm: f64) -> Candidate {
+        while passes_mm > 0.0 {
+            let dearest = best.score + DEAREST_BENDS * self.price(5, 1);
+            let fewer = self.changes(&best).into_iter().filter(|c| c.model.lra.bends.len() < best.bends());
+            let fitted = fewer.map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
+            let none = fitted.filter(|(c, _)| {
+                c.score < dearest && self.line.apart_mm(&best.model, &c.model) < ABOVE_PASSES * passes_mm
+            });
+            let Some((less, what)) = none.min_by(|a, b| a.0.score.total_cmp(&b.0.score)) else { break };
+            let um = 1e3 * passes_mm;
+            let what = format!("{what}: it moves the tube by no more than the passes disagree ({um:.0} um)");
+            self.decide(what, None, best.score - less.score, true);
+            best = less;
+        }
+        best
+    }
+
+    /// All changes by one bend that may be worth it, each fitted.
+    fn tried(&self, best: &Candidate) -> Vec<(Change, Candidate)> {
+        let changes = self.changes(best);
+        let fit = |change: Change| {
+            let candidate = self.fit(&change.model, TRIAL_STEPS, best.score);
+            (change, candidate)
+        };
+        changes.into_par_iter().map(fit).collect()
+    }
+
+    /// The changes that may be worth it.
+    fn changes(&self, best: &Candidate) -> Vec<Change> {
+        let model = &best.model;
+        let n = model.lra.bends.len();
+        let solved = Solved::new(&self.line, model, &best.parameters);
+        let variance = self.line.noise_mm.powi(2) * self.correlation;
+        // How certainly a value differs from zero, in terms of the score.
+        let worth = |parameter: Parameter, value: f64| {
+            let at = best.parameters.iter().position(|p| *p == parameter);
+            at.map_or(0.0, |j| value * value / (solved.inverse[(j, j)] * variance).max(1e-300))
+        };
+        let bearable = DOUBT * self.price(5, 1);
+        let bends = &model.lra.bends;
+        let spine = model.spine();
+        let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
+        let change = |what: String, bend: Option<usize>, model: TubeModel| Change { what, bend, model };
+        let shallow = |i: &usize| worth(Parameter::Angle(*i), bends[*i].angle_rad) < bearable;
+        let dropped = (0..n).filter(shallow).map(|i| {
+            change(format!("the bend at {:.0} mm pulled straight", at(i)), Some(i), without_bend(model, i))
+        });
+        let merged = likeliest_pairs(model).into_iter().filter_map(|i| {
+            let what = format!("the bends at {:.0} and {:.0} mm made one", at(i - 1), at(i));
+            Some(change(what, Some(i - 1), merged(model, i)?))
+        });
+        let joints = self.joints(best, &solved);
+        let inserted = joints.iter().flat_map(|j| {
+            let what = format!("a bend put in at {:.0} mm", j.at_mm);
+            with_bend(model, j).into_iter().map(move |m| change(what.clone(), None, m))
+        });
+        let split = joints.iter().flat_map(|j| {
+            let what = format!("the bend at {:.0} mm made two", j.at_mm);
+            split(model, j).into_iter().map(move |m| change(what.clone(), None, m))
+        });
+        let doubled = (0..n).filter_map(|i| {
+            let what = format!("the wide bend at {:.0} mm made two of the usual CLR", at(i));
+            Some(change(what, Some(i), doubled(model, i)?))
+        });
+        let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled);
+        all.filter(|c| c.model.lra.bends.len() <= MOST_BENDS).collect()
+    }
+
+    /// Places where a joint would help, the most helpful first, no two close together.
+    fn joints(&self, best: &Candidate, solved: &Solved) -> Vec<Joint> {
+        let radius = best.model.tube_radius_mm;
+        let mut joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
+        joints.retain(|j| j.gain > JOINT_GAIN * self.correlation);
+        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
+        let mut out: Vec<Joint> = Vec::new();
+        for joint in joints {
+            if out.len() < JOINTS && out.iter().all(|o| (joint.at_mm - o.at_mm).abs() > 2.0 * radius) {
+                out.push(joint);
+            }
+        }
+        out
+    }
+}
