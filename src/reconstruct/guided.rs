@@ -108,6 +108,7 @@ fn fitted(
     correlation: f64,
     steps: usize,
 ) -> Fitted {
+    let model = model.settled();
     let parameters = model.parameters();
     let noise_mm = line.noise_mm;
     let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: f64::INFINITY };

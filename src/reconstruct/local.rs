@@ -212,7 +212,7 @@ impl Arc {
 
     /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
     /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
-    /// speed of convergence.
+    /// speed of convergence, on arcs that are not all ramp (`TubeModel::may_be_oval`).
     pub fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
         let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
         let full = self.full_ramp_mm(tube_radius_mm);

@@ -51,8 +51,9 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample, radius_doubt: f64) -> Measure
     let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
     let mut sigma = at.like(sigmas);
     sigma.radii.iter_mut().for_each(|s| *s *= radius_doubt);
-    let mut report = Report { sigma, at, ends, first, last, warnings: Vec::new() };
     let n = fit.model.lra.bends.len();
+    let oval = (0..n).map(|i| fit.model.may_be_oval(i)).collect();
+    let mut report = Report { sigma, at, oval, ends, first, last, warnings: Vec::new() };
     let bends = (0..n).map(|i| report.bend(i)).collect();
     let last_length = report.length(n);
     let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
@@ -91,6 +92,8 @@ fn cut(end: Option<End>) -> Option<(f64, f64)> {
 struct Report {
     at: Values,
     sigma: Values,
+    /// Whether a bend is long enough to tell how oval it is.
+    oval: Vec<bool>,
     ends: Ends,
     first: Option<End>,
     last: Option<End>,
@@ -104,7 +107,7 @@ impl Report {
         let radius = self.radius(i);
         // Less certain than this it says nothing of the bend's quality; no warning, since nothing else depends on it.
         let ovality = Some((self.at.ovalities[i], self.sigma.ovalities[i]));
-        let ovality = ovality.filter(|(_, sigma)| *sigma < MAX_OVALITY_SIGMA);
+        let ovality = ovality.filter(|(_, sigma)| *sigma < MAX_OVALITY_SIGMA && self.oval[i]);
         MeasuredBend {
             length_mm: length.map(|l| l.0),
             length_sigma_mm: length.map(|l| l.1),

@@ -79,6 +79,9 @@ pub struct Column {
     pub motion: Motion,
 }
 
+/// A bend whose arc is shorter than this, in tube radii, is not long enough to become oval: between its ramps nothing is left.
+const SHORTEST_OVAL_RADII: f64 = 0.7;
+
 /// Ovality beyond this share of the radius is no bent tube's any more.
 const MOST_OVAL: f64 = 0.15;
 
@@ -103,13 +106,31 @@ impl TubeModel {
             if !self.common_radius {
                 all.push(Parameter::BendRadius(i));
             }
-            all.push(Parameter::Ovality(i));
+            if self.may_be_oval(i) {
+                all.push(Parameter::Ovality(i));
+            }
         }
         if self.common_radius && n > 0 {
             all.push(Parameter::CommonRadius);
         }
         all.push(Parameter::TubeRadius);
         all
+    }
+
+    /// Whether a bend is long enough for an oval section; where it is not its ovality is no free value, and 0 by rule.
+    pub fn may_be_oval(&self, i: usize) -> bool {
+        let bend = &self.lra.bends[i];
+        bend.radius_mm * bend.angle_rad >= SHORTEST_OVAL_RADII * self.tube_radius_mm
+    }
+
+    /// The model with what is 0 by rule at 0.
+    pub fn settled(mut self) -> TubeModel {
+        for i in 0..self.ovality_mm.len() {
+            if !self.may_be_oval(i) {
+                self.ovality_mm[i] = 0.0;
+            }
+        }
+        self
     }
 
     /// The centre line.

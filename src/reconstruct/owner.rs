@@ -30,6 +30,8 @@ pub struct Surroundings {
     radius_mm: f64,
     /// The centre line in steps of about half a cell, drawn out a radius at both ends.
     places: Vec<Point3<f64>>,
+    /// Those of the centre line itself.
+    own_places: std::ops::Range<usize>,
     low: Point3<f64>,
     cell_mm: f64,
     size: [usize; 3],
@@ -54,6 +56,7 @@ impl Surroundings {
         let mut around = Surroundings {
             radius_mm,
             places: Vec::new(),
+            own_places: 0..0,
             low,
             cell_mm,
             size,
@@ -61,7 +64,13 @@ impl Surroundings {
             window: 6,
         };
         let mut squares = vec![f64::INFINITY; around.nearest.len()];
-        for edge in drawn_out.windows(2) {
+        let last = drawn_out.len() - 2;
+        for (k, edge) in drawn_out.windows(2).enumerate() {
+            match k {
+                1 => around.own_places.start = around.places.len(),
+                _ if k == last => around.own_places.end = around.places.len(),
+                _ => {}
+            }
             let steps = ((edge[1] - edge[0]).norm() / step).ceil().max(1.0);
             for k in 0..steps as usize {
                 let place = edge[0] + (edge[1] - edge[0]) * (k as f64 / steps);
@@ -122,18 +131,27 @@ impl Surroundings {
 
     /// Distance of a point from the centre line; None where that is not near.
     pub fn distance_mm(&self, p: &Point3<f64>) -> Option<f64> {
+        Some(self.nearest_edge(p)?.1.sqrt())
+    }
+
+    /// The edge between places that is nearest to a point, and the square of its distance; None where none is near.
+    fn nearest_edge(&self, p: &Point3<f64>) -> Option<(usize, f64)> {
         let place = self.place(p)?;
         let from = place.saturating_sub(self.window);
         let to = (place + self.window).min(self.places.len() - 1);
         let squares = self.places[from..=to].windows(2).map(|edge| square_from(edge, p));
-        Some(squares.fold(f64::INFINITY, f64::min).sqrt())
+        squares.enumerate().map(|(k, square)| (from + k, square)).min_by(|a, b| a.1.total_cmp(&b.1))
     }
 
-    /// Whether a point is the tube's, beside faces that may be there.
+    /// Whether a point is the tube's, beside faces that may be there. On a face that goes on beyond the tube's end there is
+    /// no tube, however near to it.
     pub fn owns(&self, p: &Point3<f64>, faces: &[Face]) -> bool {
-        let on_tube = |distance: f64| (distance - self.radius_mm).abs() < SURFACE_SHARE * self.radius_mm;
+        let on_tube = |(edge, square): (usize, f64)| {
+            let off = (square.sqrt() - self.radius_mm).abs();
+            off < SURFACE_SHARE * self.radius_mm && self.own_places.contains(&edge)
+        };
         if faces.iter().any(|f| f.holds(p)) {
-            self.distance_mm(p).is_some_and(on_tube)
+            self.nearest_edge(p).is_some_and(on_tube)
         } else {
             self.is_near(p)
         }
@@ -208,6 +226,8 @@ mod tests {
         let faces = [table];
         assert!(around.owns(&Point3::new(50.0, 0.0, -10.02), &faces), "at the line of contact");
         assert!(around.owns(&Point3::new(50.0, 8.0, 6.0), &faces), "on the tube");
+        assert!(!around.owns(&Point3::new(123.0, 0.0, -10.02), &faces), "on the table beyond the end");
+        assert!(around.owns(&Point3::new(123.0, 0.0, -10.02), &[]), "the end itself lies a little beyond");
         assert!(!around.owns(&Point3::new(50.0, 6.0, -10.02), &faces), "beside the tube on the table");
         assert!(around.owns(&Point3::new(50.0, 6.0, -10.02), &[]), "nothing is known of a table");
         assert!(!around.owns(&Point3::new(50.0, 30.0, 0.0), &[]), "far away");

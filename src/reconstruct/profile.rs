@@ -18,7 +18,7 @@ const SHORT_RADII: f64 = 0.3;
 
 /// Halvings of the step, and steps of a fit.
 const HALVINGS: usize = 10;
-const STEPS: usize = 12;
+const STEPS: usize = 60;
 
 /// A value with its standard deviation as found by moving it.
 pub type Held = (Parameter, f64);

@@ -32,9 +32,12 @@ const JOINT_GAIN: f64 = 30.0;
 const JOINTS: usize = 3;
 const ROUNDS: usize = 20;
 
+/// A bend is taken elsewhere for no less than this: what a descent leaves undone is no reason.
+const LEAST_MOVE: f64 = 1.0;
+
 /// Bends that are tried elsewhere, and how many bends' price taking one out may cost.
 const MOVED: usize = 3;
-const DEAREST_BENDS: f64 = 8.0;
+const DEAREST_MOVED: f64 = 8.0;
 
 /// A joint that takes away such a share of all misfit is looked into, however large the misfit.
 const EXPLAINED: f64 = 0.2;
@@ -42,6 +45,8 @@ const EXPLAINED: f64 = 0.2;
 /// A bend must move the tube by this many times what the passes lie apart: of passes 20 to 80 micrometres apart the bends that
 /// were none moved it by 1.1 to 2.5 times that, true ones by 3 and more.
 const ABOVE_PASSES: f64 = 2.5;
+/// One that explains more than so many bends' price is none of the passes' making.
+const DEAREST_NONE: f64 = 3.0;
 
 /// Steps of a fit, and of one that only has to show whether a change is worth it.
 pub(super) const FULL_STEPS: usize = 100;
@@ -85,6 +90,7 @@ struct Change {
 impl Jury {
     /// Fits a model to the sections; given up when it cannot score below `goal`.
     pub(super) fn fit(&self, model: &TubeModel, steps: usize, goal: f64) -> Candidate {
+        let model = model.clone().settled();
         let parameters = model.parameters();
         let noise_mm = self.line.noise_mm;
         let worth = (goal - self.price(parameters.len(), model.lra.bends.len()))
@@ -93,7 +99,7 @@ impl Jury {
             * noise_mm
             / 2.0;
         let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth };
-        let descent = descend(&mut self.line.clone(), model.clone(), &parameters, self.prior, way);
+        let descent = descend(&mut self.line.clone(), model, &parameters, self.prior, way);
         self.scored(descent, parameters)
     }
 
@@ -148,7 +154,7 @@ impl Jury {
     /// The best candidate with one bend taken out and one put in elsewhere, if that is better: two shallow bends of which
     /// one has taken the other's part are no step of one bend away from right.
     fn moved(&mut self, best: &Candidate, tried: &[(Change, Candidate)]) -> Option<Candidate> {
-        let dearest = best.score + DEAREST_BENDS * self.price(5, 1);
+        let dearest = best.score + DEAREST_MOVED * self.price(5, 1);
         let fewer = tried.iter().filter(|(_, c)| c.bends() < best.bends() && c.score < dearest);
         let mut changes = Vec::new();
         for (change, candidate) in fewer.take(MOVED) {
@@ -160,7 +166,7 @@ impl Jury {
         let fitted: Vec<(String, Candidate)> = changes.into_par_iter().map(fit).collect();
         let (what, candidate) = fitted.into_iter().min_by(|a, b| a.1.score.total_cmp(&b.1.score))?;
         let gain = best.score - candidate.score;
-        if gain < LEAST_GAIN {
+        if gain < LEAST_MOVE {
             return None;
         }
         self.decide(what, None, gain, true);
@@ -196,7 +202,7 @@ impl Jury {
     /// The tube without the bends that move it by no more than its scan's passes disagree.
     pub(super) fn material(&mut self, mut best: Candidate, passes_mm: f64) -> Candidate {
         while passes_mm > 0.0 {
-            let dearest = best.score + DEAREST_BENDS * self.price(5, 1);
+            let dearest = best.score + DEAREST_NONE * self.price(5, 1);
             let fewer = self.changes(&best).into_iter().filter(|c| c.model.lra.bends.len() < best.bends());
             let fitted = fewer.map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
             let none = fitted.filter(|(c, _)| {

@@ -30,6 +30,9 @@ pub const SPREADS: [f64; VALUES] = [0.01, 0.3, 0.3, 0.02, 0.02];
 const OVAL_DOUBT: f64 = 1e-5;
 const OVAL_DOUBT_SHARE: f64 = 0.15;
 const OVAL_DOUBT_RADII: f64 = 1.2;
+/// How oval a bend may be that is too short to tell, in tube radii; sections that lie on it hardly reach beyond it by this.
+const OVAL_UNTOLD: f64 = 0.02;
+const OVAL_UNTOLD_RADII: f64 = 0.25;
 
 /// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.
 pub const JUDGED_POINTS: f64 = 8.0;
@@ -68,9 +71,13 @@ pub fn oval_doubt_mm(base: &TubeModel, spine: &Spine, at_mm: f64) -> f64 {
     let radius = base.tube_radius_mm;
     let beside = |(i, e): (usize, &f64)| {
         let arc = &spine.segments()[2 * i + 1];
+        let (from, to) = (arc.start_mm, arc.start_mm + arc.length_mm);
+        if !base.may_be_oval(i) {
+            let reach = OVAL_UNTOLD_RADII * radius;
+            return if (from - reach..=to + reach).contains(&at_mm) { OVAL_UNTOLD * radius } else { 0.0 };
+        }
         let near = |tangent_mm: f64| (at_mm - tangent_mm).abs() < OVAL_DOUBT_RADII * radius;
-        let doubtful = near(arc.start_mm) || near(arc.start_mm + arc.length_mm);
-        if doubtful { OVAL_DOUBT_SHARE * e.abs() } else { 0.0 }
+        if near(from) || near(to) { OVAL_DOUBT_SHARE * e.abs() } else { 0.0 }
     };
     let most = base.ovality_mm.iter().enumerate().map(beside).fold(0.0, f64::max);
     most.hypot(OVAL_DOUBT * radius)
