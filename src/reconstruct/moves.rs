@@ -2,11 +2,11 @@
 //!
 //! Under `structure`, which fits every changed tube and keeps what the data supports.
 
-use nalgebra::{UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Point3, UnitQuaternion, Vector2, Vector3};
 
 use super::evidence::Joint;
 use super::model::TubeModel;
-use crate::tube::{Bend, Lra, Segment};
+use crate::tube::{Bend, Frame, Lra, Segment};
 
 /// Seamless joints in one plane from which on a table is no bent tube's.
 const FREE_FORM_JOINTS: usize = 4;
@@ -31,6 +31,45 @@ pub fn mean_radius_mm(model: &TubeModel) -> Option<f64> {
     let weight: f64 = model.lra.bends.iter().map(|b| b.angle_rad).sum();
     let sum: f64 = model.lra.bends.iter().map(|b| b.angle_rad * b.radius_mm).sum();
     (weight > 0.0).then(|| sum / weight)
+}
+
+/// Points this near to an end straight's surface are its own; it goes on while stretches of this length, in tube radii, hold
+/// such a share of the points that the first of them does.
+const OWN_SHARE: f64 = 0.1;
+const STRETCH_RADII: f64 = 0.5;
+const LEAST_DENSITY: f64 = 0.3;
+
+/// The tube with end straights that reach at least as far as its points do: no fit moves their ends, and bends come and go
+/// beside them.
+pub fn reaching(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
+    let spine = model.spine();
+    let radius = model.tube_radius_mm;
+    let stretch_mm = STRETCH_RADII * radius;
+    // How far the points go on along +x of a frame from its origin.
+    let beyond_mm = |frame: &Frame| {
+        let inverse = frame.inverse();
+        let mut counts: Vec<usize> = Vec::new();
+        for p in points.iter().map(|p| inverse * p) {
+            let stretch = (p.x / stretch_mm + 1.0).floor();
+            if stretch >= 0.0 && (p.y.hypot(p.z) - radius).abs() < OWN_SHARE * radius {
+                let stretch = stretch as usize;
+                counts.resize(counts.len().max(stretch + 1), 0);
+                counts[stretch] += 1;
+            }
+        }
+        let usual = counts.first().copied().unwrap_or(0) as f64;
+        let more = counts.iter().skip(1).take_while(|c| **c as f64 > LEAST_DENSITY * usual).count();
+        more as f64 * stretch_mm
+    };
+    let outward = model.start * Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
+    let (before_mm, after_mm) = (beyond_mm(&outward), beyond_mm(&spine.frame_at(spine.length_mm())));
+    let mut out = model.clone();
+    out.lra.last_length_mm += after_mm;
+    if let Some(first) = out.lra.bends.first_mut() {
+        first.length_mm += before_mm;
+        out.start *= Frame::translation(-before_mm, 0.0, 0.0);
+    }
+    out
 }
 
 /// The tube with one CLR for all bends.

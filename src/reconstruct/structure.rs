@@ -10,7 +10,7 @@ use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
-use super::moves::{is_free_form, mean_radius_mm, with_common_radius, without_bend};
+use super::moves::{is_free_form, mean_radius_mm, reaching, with_common_radius, without_bend};
 use super::passes;
 use super::profile::{Held, lengths};
 use super::scene::Scene;
@@ -102,6 +102,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     let mut best =
         fitted.iter().map(|c| jury.judge(c.model.clone())).min_by(|a, b| a.score.total_cmp(&b.score))?;
     for _ in 0..MEASUREMENTS {
+        best.model = reaching(&best.model, sample);
         jury.line = CentreLine::measure(sample, &best.model, true);
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
         jury.correlation = jury.line.correlation(&best.model);
