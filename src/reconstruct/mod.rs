@@ -87,7 +87,7 @@ impl Reconstruction {
 }
 
 /// Cell of the sample that decides the structure, in tube radii.
-const SAMPLE_CELL_RADII: f64 = 0.2;
+const SAMPLE_CELL_RADII: f64 = 0.12;
 
 /// The points that decide the structure.
 pub fn sample(scene: &Scene) -> Vec<Point3<f64>> {
