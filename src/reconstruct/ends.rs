@@ -8,10 +8,11 @@ use nalgebra::Point3;
 use super::face::{self, Face, Search};
 use super::outline::{self, Outline};
 
-/// No saw cuts this far from square; the edge of a scan may (8 degrees).
-const MOST_OBLIQUE: f64 = 0.1405;
-/// Faces steeper than a good saw leaves them (7 and 16 degrees) are looked for only where the outline is that oblique too.
-const STEEPEST_FACES: [f64; 2] = [0.1228, 0.2867];
+/// No saw cuts this far from square (16 degrees); the edge of a scan may.
+const MOST_OBLIQUE: f64 = 0.2867;
+/// Faces steeper than a saw that is set square leaves them (7 degrees) are looked for only where the outline is that
+/// oblique too.
+const STEEPEST_FACES: [f64; 2] = [0.1228, MOST_OBLIQUE];
 /// A cut angle less certain than this is not given.
 const MAX_CUT_SIGMA_RAD: f64 = std::f64::consts::PI / 180.0;
 /// Share of the sectors around the tube that must end together.
@@ -68,10 +69,10 @@ impl End {
 
 /// The end of a tube that lies along +x from it: `points` on and in the tube in a frame whose x axis is the tube's, of
 /// whose outside they scatter by `noise_mm`. None when too little was scanned there.
-pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<End> {
+pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, passes_mm: f64) -> Option<End> {
     let outside = |p: &&Point3<f64>| OUTSIDE_SIGMAS.contains(&((p.y.hypot(p.z) - radius_mm) / noise_mm));
     let surface: Vec<Point3<f64>> = points.iter().filter(outside).copied().collect();
-    let outline = outline::find(&surface, radius_mm, noise_mm)?;
+    let outline = outline::find(&surface, radius_mm, noise_mm, passes_mm)?;
     let near_mm = DIFFERENT_SIGMAS * outline.sigma_mm + outline.step_mm.max(3.0 * noise_mm);
     let oblique = outline.loose_size() - DIFFERENT_SIGMAS * outline.loose_sigma > 0.5 * STEEPEST_FACES[0];
     let about =
@@ -91,6 +92,7 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<End
         if sigma_mm < outline.sigma_mm {
             let variance = [face.covariance[(1, 1)], face.covariance[(1, 2)], face.covariance[(2, 2)]];
             let cut_rad = cut(&face.slope, &variance);
+            let sigma_mm = sigma_mm.hypot(passes_mm);
             return Some(End::Found(Place { at_mm: face.at_mm, sigma_mm, cut_rad, by_outline: false }));
         }
     }
@@ -161,7 +163,7 @@ mod tests {
     }
 
     fn found(points: &[Point3<f64>]) -> Place {
-        match find(points, RADIUS, NOISE) {
+        match find(points, RADIUS, NOISE, 0.0) {
             Some(End::Found(place)) => place,
             other => panic!("{other:?}"),
         }
@@ -227,21 +229,21 @@ mod tests {
 
     #[test]
     fn the_edge_of_the_scan_is_no_end() {
-        let Some(End::CutOff { slope_rad, .. }) = find(&half_tube(3.0, 0.6), RADIUS, NOISE) else {
+        let Some(End::CutOff { slope_rad, .. }) = find(&half_tube(3.0, 0.6), RADIUS, NOISE, 0.0) else {
             panic!("31 degrees from square is no saw's work");
         };
         assert!((slope_rad.to_degrees() - 31.0).abs() < 3.0, "{}", slope_rad.to_degrees());
         // Steps of two radii: no plane at all.
         let steps = |p: &Point3<f64>| p.x > 20.0 * (0.8 * p.z).sin().signum();
         let ragged: Vec<_> = half_tube(-20.0, 0.0).into_iter().filter(steps).collect();
-        assert!(!matches!(find(&ragged, RADIUS, NOISE), Some(End::Found(_))));
+        assert!(!matches!(find(&ragged, RADIUS, NOISE, 0.0), Some(End::Found(_))));
     }
 
     #[test]
     fn an_end_that_was_not_scanned_is_unknown() {
-        assert_eq!(find(&[], RADIUS, NOISE), None);
-        assert_eq!(find(&half_tube(3.0, 0.0)[..2], RADIUS, NOISE), None);
-        assert_eq!(find(&[Point3::new(f64::NAN, 0.0, 0.0)], RADIUS, NOISE), None);
+        assert_eq!(find(&[], RADIUS, NOISE, 0.0), None);
+        assert_eq!(find(&half_tube(3.0, 0.0)[..2], RADIUS, NOISE, 0.0), None);
+        assert_eq!(find(&[Point3::new(f64::NAN, 0.0, 0.0)], RADIUS, NOISE, 0.0), None);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use super::ends::{self, End};
 use super::fit::Fit;
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
+use super::passes;
 use crate::tube::{Frame, MeasuredBend, MeasuredTube, Spine};
 
 /// Above these a value is not given (design: null with a warning, never a guess).
@@ -215,20 +216,24 @@ fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
     let spine = fit.model.spine();
     let last_segment = spine.segments().len() - 1;
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
-    let look = |segment: usize, frame: &Frame, length_mm: f64| -> Option<End> {
+    let own = |segment: usize, frame: &Frame, length_mm: f64| -> Vec<Point3<f64>> {
         let inverse = frame.inverse();
         let mine = sample.points.iter().zip(sample.segments()).filter(|(_, s)| **s as usize == segment);
-        let points: Vec<Point3<f64>> = mine.map(|(p, _)| inverse * p).filter(|p| p.x <= length_mm).collect();
-        ends::find(&points, radius, noise)
+        mine.map(|(p, _)| inverse * p).filter(|p| p.x <= length_mm).collect()
     };
     // Both looked at along the way into the tube.
     let (first_segment, end_segment) = (&spine.segments()[0], &spine.segments()[last_segment]);
     let first_frame = first_segment.start;
     let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
     let last_frame = spine.frame_at(spine.length_mm()) * back;
+    let (first_points, last_points) = rayon::join(
+        || own(0, &first_frame, first_segment.length_mm),
+        || own(last_segment, &last_frame, end_segment.length_mm),
+    );
+    let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise);
     let (first, last) = rayon::join(
-        || look(0, &first_frame, first_segment.length_mm),
-        || look(last_segment, &last_frame, end_segment.length_mm),
+        || ends::find(&first_points, radius, noise, passes_mm),
+        || ends::find(&last_points, radius, noise, passes_mm),
     );
     let model = &mut fit.model;
     if let Some(end) = last {

@@ -12,6 +12,7 @@ pub mod bound;
 pub mod crust;
 pub mod cylinder;
 mod direction;
+mod edge;
 mod ends;
 mod error;
 mod evidence;
@@ -43,7 +44,9 @@ mod search_tests;
 mod section;
 mod sections;
 pub mod simplify;
+mod square;
 mod stretches;
+mod stripes;
 pub mod structure;
 mod whole;
 

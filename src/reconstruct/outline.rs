@@ -1,12 +1,14 @@
-//! Where the tube's outside stops: the outline of the scanned points at an end, sector by sector around the tube.
+//! Where the tube's outside stops: the outline of the scanned points at an end.
 //!
-//! The first points of a sector fall short of the edge by up to a step of the scan's pattern. How much, and how alike
-//! in all sectors, depends on how the stripes run; so the pattern itself is asked: the same points are cut at known
-//! places further inside, the same estimate is made there, and its mean error is the correction, its scatter the sigma.
+//! Sector by sector around the tube first: the plane on which most of them begin tells which ones count, those with a burr or
+//! with something that touches the tube do not. Then by all points of these together ([`edge`](super::edge)), which is much
+//! closer. Whether the end was cut square or mitred is weighed last ([`square`]).
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
+use super::edge::Edge;
 use super::radius::median;
+use super::square::{self, Estimate, Weighed};
 
 /// Sectors around the tube: not narrower than this many steps of the pattern.
 const SECTOR_STEPS: f64 = 1.5;
@@ -19,21 +21,23 @@ const REACH_RADII: f64 = 6.0;
 /// Fewest points of a sector and fewest sectors.
 const MIN_POINTS: usize = 4;
 const MIN_SECTORS: usize = 3;
-
-/// A sawn end is this square: standard deviation of each component of its slope (2.5 degrees).
-const SQUARE_SPREAD: f64 = 0.0437;
+/// A sector with less than this share of the densest one's points per millimetre holds stray ones.
+const LEAST_DENSE: f64 = 0.1;
 
 /// The outline's own slope before anything is expected of it (45 degrees).
 const LOOSE_SPREAD: f64 = 1.0;
-
-/// Cuts at known places.
-const CUTS: usize = 96;
-
-/// What the cuts teach is uncertain as if from this many layers of points less.
-const LEARNING: f64 = 5.0;
-
 /// Cut-off of the biweight over sectors, in standard deviations of one sector.
 const CUTOFF_SECTORS: f64 = 5.0;
+/// A few sectors that agree better than to this share of a step do so by chance: the others are not wrong.
+const CHANCE_STEPS: f64 = 0.1;
+/// How far a sector's beginning errs, in steps: its first points fall short of the edge by up to one.
+const SECTOR_STEPS_SIGMA: f64 = 0.4;
+/// A sector that begins farther from the plane than this does not agree, however much the others scatter.
+const AGREE_STEPS: f64 = 2.0;
+/// What is left of an end beside a burr is square within so many standard deviations of its slope.
+const SQUARE_SIGMAS: f64 = 2.0;
+/// Sectors of less weight do not stop at the plane.
+const LEAST_WEIGHT: f64 = 0.5;
 
 /// The outline of an end as a plane: x = at + slope . (y, z).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,63 +68,43 @@ impl Outline {
     }
 }
 
-/// One sector: its points along the tube (past the plane's slope), in order.
-struct Sector {
-    /// Of the plane: 1, y, z at the sector's middle.
-    row: Vector3<f64>,
-    along: Vec<f64>,
-    /// Sums of `along` up to each point.
-    sums: Vec<f64>,
-    /// Points per millimetre, and how many make the first layer.
-    per_mm: f64,
-    layer: usize,
-}
-
-impl Sector {
-    /// Where the sector begins if nothing before `from` were known: mean of its first layer less half the layer.
-    fn begins(&self, from: f64) -> Option<f64> {
-        let i = self.along.partition_point(|u| *u < from);
-        let k = i + self.layer;
-        (k < self.sums.len()).then(|| {
-            (self.sums[k] - self.sums[i]) / self.layer as f64 - 0.5 * self.layer as f64 / self.per_mm
-        })
-    }
-}
-
 /// Finds the outline at the beginning of points of the tube's outside, in a frame whose x axis is the tube's and leads
-/// into it. None when too little was scanned there.
-pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<Outline> {
-    let mut along: Vec<f64> = points.iter().map(|p| p.x).collect();
-    along.sort_by(f64::total_cmp);
-    let first = solid_start(&along, 2.0 * radius_mm)?;
-    let step = step_mm(points, first, radius_mm)?;
-    let mut slope = [0.0, 0.0];
-    let mut loose_at_mm = first;
-    // The slope first, by the data alone; then all again along it.
-    for _ in 0..3 {
-        let sectors = sectors(points, &slope, first, radius_mm, step, noise_mm);
-        let value = Plane::loose(&sectors, radius_mm)?;
-        slope = [slope[0] + value.y, slope[1] + value.z];
-        loose_at_mm = value.x;
+/// into it, scanned in passes that disagree by `passes_mm`. None when too little was scanned there.
+pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, passes_mm: f64) -> Option<Outline> {
+    let rim = Rim::new(points, radius_mm, noise_mm)?;
+    // The slope first; then all again along it.
+    let mut rough = Rough::find(&rim, [0.0, 0.0])?;
+    for _ in 0..2 {
+        rough = Rough::find(&rim, rough.slope())?;
     }
-    let loose_slope = slope;
-    let size = slope[0].hypot(slope[1]);
-    // Cuts are made along the slope that is expected of a sawn end.
-    let shrink = if size > 2.0 * SQUARE_SPREAD { 2.0 * SQUARE_SPREAD / size } else { 1.0 };
-    let base = [slope[0] * shrink, slope[1] * shrink];
-    let sectors = sectors(points, &base, first, radius_mm, step, noise_mm);
-    let plane = Plane::fit(&sectors, base, step)?;
+    // Passes that see different sides also tilt what they see together.
+    let tilt = passes_mm / radius_mm;
+    let passes = Matrix3::from_diagonal(&Vector3::new(passes_mm, tilt, tilt).map(|s| s * s));
+    let edge = rough.edge(&rim);
+    let mut fine = rough.refined(edge.as_ref(), &passes);
+    if let Some(clean) = edge.as_ref().and_then(Edge::without_burr) {
+        let other = rough.refined(Some(&clean), &passes);
+        fine = if other.is_square() { other } else { fine };
+    }
+    let Fine { free, both } = fine;
+    let Estimate { value, variance } = both.estimate;
     Some(Outline {
-        at_mm: plane.value.x,
-        sigma_mm: plane.variance[(0, 0)].sqrt(),
-        slope: [base[0] + plane.value.y, base[1] + plane.value.z],
-        slope_variance: [plane.variance[(1, 1)], plane.variance[(1, 2)], plane.variance[(2, 2)]],
-        loose_at_mm,
-        loose_slope,
-        loose_sigma: plane.loose_sigma(&loose_slope),
-        step_mm: step,
-        agreeing: plane.agreeing,
+        at_mm: value.x,
+        sigma_mm: both.sigma_mm,
+        slope: [value.y, value.z],
+        slope_variance: [variance[(1, 1)], variance[(1, 2)], variance[(2, 2)]],
+        loose_at_mm: free.value.x,
+        loose_slope: [free.value.y, free.value.z],
+        loose_sigma: slope_sigma(&free),
+        step_mm: rim.step_mm,
+        agreeing: rough.agreeing(rim.step_mm),
     })
+}
+
+/// Standard deviation of a plane's slope along itself.
+fn slope_sigma(plane: &Estimate) -> f64 {
+    let along = Vector3::new(0.0, plane.value.y, plane.value.z).try_normalize(1e-12).unwrap_or_default();
+    along.dot(&(plane.variance * along)).max(0.0).sqrt()
 }
 
 /// First coordinate from which on the points come as densely as usual: stray points before it do not count.
@@ -153,237 +137,178 @@ fn sector_of(p: &Point3<f64>, sectors: usize) -> usize {
     ((turn * sectors as f64) as usize).min(sectors - 1)
 }
 
-fn sectors(
-    points: &[Point3<f64>],
-    slope: &[f64; 2],
-    first: f64,
+/// Place along the tube past a slope.
+fn past(p: &Point3<f64>, slope: [f64; 2]) -> f64 {
+    p.x - slope[0] * p.y - slope[1] * p.z
+}
+
+/// The points at an end and the pattern they lie in.
+struct Rim<'a> {
+    points: &'a [Point3<f64>],
     radius_mm: f64,
-    step: f64,
     noise_mm: f64,
-) -> Vec<Sector> {
-    let around = std::f64::consts::TAU * radius_mm;
-    let count = (around / (SECTOR_STEPS * step)).clamp(FEWEST_SECTORS, MOST_SECTORS) as usize;
-    let mut along: Vec<Vec<f64>> = vec![Vec::new(); count];
-    // A slope of 45 degrees begins a radius before the axis does.
-    let (from, to) = (first - 1.5 * radius_mm, first + REACH_RADII * radius_mm);
-    for p in points {
-        let u = p.x - slope[0] * p.y - slope[1] * p.z;
-        if u >= from && u < to {
-            along[sector_of(p, count)].push(u);
-        }
-    }
-    let depth = step.max(3.0 * noise_mm);
-    let seen = along.into_iter().enumerate().filter(|(_, a)| a.len() >= MIN_POINTS);
-    seen.filter_map(|(i, mut along)| {
+    /// Where they begin.
+    first_mm: f64,
+    step_mm: f64,
+    /// Number of sectors.
+    count: usize,
+}
+
+/// One sector with points.
+struct Sector {
+    index: usize,
+    /// Of the plane: 1, y, z at the sector's middle.
+    row: Vector3<f64>,
+    /// Its first point along the tube past a slope.
+    first_mm: f64,
+    /// Where it begins: mean of its first layer less half the layer.
+    begin_mm: f64,
+    per_mm: f64,
+}
+
+impl Rim<'_> {
+    fn new(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<Rim<'_>> {
+        let mut along: Vec<f64> = points.iter().map(|p| p.x).collect();
         along.sort_by(f64::total_cmp);
-        let begin = solid_start(&along, 2.0 * radius_mm)?;
-        along.drain(..along.partition_point(|u| *u < begin));
-        let per_mm = (along.len() - 1) as f64 / (along[along.len() - 1] - along[0]).max(1e-9);
-        let turn = ((i as f64 + 0.5) / count as f64 - 0.5) * std::f64::consts::TAU;
-        let mut sums = vec![0.0];
-        along.iter().for_each(|u| sums.push(sums[sums.len() - 1] + u));
-        let layer = ((per_mm * depth).round() as usize).clamp(1, along.len());
-        let row = Vector3::new(1.0, radius_mm * turn.cos(), radius_mm * turn.sin());
-        (along.len() >= MIN_POINTS).then_some(Sector { row, along, sums, per_mm, layer })
-    })
-    .collect()
-}
-
-/// How far one sector's beginning errs.
-#[derive(Debug, Clone, Copy)]
-struct Scatter {
-    /// Mean at the known cuts.
-    bias_mm: f64,
-    /// Standard deviation there.
-    sigma_mm: f64,
-    /// None begins earlier than this before the others: a burr does.
-    early_mm: f64,
-}
-
-impl Scatter {
-    fn of(errors: &[Vec<f64>], step: f64) -> Scatter {
-        let mut all: Vec<f64> = errors.iter().flatten().copied().collect();
-        if all.is_empty() {
-            return Scatter { bias_mm: 0.0, sigma_mm: 0.4 * step, early_mm: step };
-        }
-        let n = all.len() as f64;
-        let bias_mm = all.iter().sum::<f64>() / n;
-        let variance = all.iter().map(|e| (e - bias_mm).powi(2)).sum::<f64>() / n;
-        let sigma_mm = variance.sqrt().max(1e-6 * step);
-        all.sort_by(f64::total_cmp);
-        let early_mm = (bias_mm - all[all.len() / 200]).max(sigma_mm);
-        Scatter { bias_mm, sigma_mm, early_mm }
+        let first_mm = solid_start(&along, 2.0 * radius_mm)?;
+        let step_mm = step_mm(points, first_mm, radius_mm)?;
+        let around = std::f64::consts::TAU * radius_mm;
+        let count = (around / (SECTOR_STEPS * step_mm)).clamp(FEWEST_SECTORS, MOST_SECTORS) as usize;
+        Some(Rim { points, radius_mm, noise_mm, first_mm, step_mm, count })
     }
 
-    /// Weight of a sector that begins `off_mm` after the plane.
-    fn weight(&self, off_mm: f64) -> f64 {
-        if off_mm < 0.0 {
-            biweight((-off_mm - self.early_mm).max(0.0) / (0.5 * self.early_mm))
-        } else {
-            biweight(off_mm / (CUTOFF_SECTORS * self.sigma_mm))
-        }
-    }
-}
-
-/// A plane fitted to the sectors' beginnings.
-struct Plane {
-    value: Vector3<f64>,
-    variance: Matrix3<f64>,
-    /// Of the plane by the data alone.
-    loose: Matrix3<f64>,
-    agreeing: f64,
-}
-
-/// Weighted least squares with the slope expected near 0: the estimate is `operator` times the sectors' values.
-struct Solver {
-    inverse: Matrix3<f64>,
-    rows: Vec<(Vector3<f64>, f64)>,
-}
-
-impl Solver {
-    /// `variance` of one sector's value against `spread` of the slope decides how far the slope is drawn to 0.
-    fn new(rows: Vec<(Vector3<f64>, f64)>, variance: f64, spread: f64) -> Option<Solver> {
-        let own: Matrix3<f64> = rows.iter().map(|(r, w)| r * r.transpose() * *w).sum();
-        let prior = variance / (spread * spread);
-        let normal = own + Matrix3::from_diagonal(&Vector3::new(0.0, prior, prior));
-        Some(Solver { inverse: normal.try_inverse()?, rows })
+    fn to_mm(&self) -> f64 {
+        self.first_mm + REACH_RADII * self.radius_mm
     }
 
-    /// The plane that most values agree on, with one value's standard deviation known: weights and solver.
-    fn robust(
-        rows: &[Vector3<f64>],
-        values: &[f64],
-        scatter: &Scatter,
-        variance: f64,
-    ) -> Option<(Solver, Vector3<f64>)> {
-        let mut weights = vec![1.0; rows.len()];
-        let mut best = None;
-        for _ in 0..6 {
-            let weighted = rows.iter().copied().zip(weights.iter().copied()).collect();
-            let solver = Solver::new(weighted, variance, SQUARE_SPREAD)?;
-            let value = solver.solve(values.iter().copied());
-            for ((w, row), v) in weights.iter_mut().zip(rows).zip(values) {
-                *w = scatter.weight(v - row.dot(&value));
+    /// The sectors, their points taken along the tube past a slope.
+    fn sectors(&self, slope: [f64; 2]) -> Vec<Sector> {
+        let mut along: Vec<Vec<f64>> = vec![Vec::new(); self.count];
+        // A slope of 45 degrees begins a radius before the axis does.
+        let from = self.first_mm - 1.5 * self.radius_mm;
+        for p in self.points {
+            let u = past(p, slope);
+            if u >= from && u < self.to_mm() {
+                along[sector_of(p, self.count)].push(u);
             }
-            best = Some((solver, value));
         }
-        best
+        let seen = along.into_iter().enumerate();
+        let mut sectors: Vec<Sector> = seen.filter_map(|(i, along)| self.sector(i, along)).collect();
+        let densest = sectors.iter().map(|s| s.per_mm).fold(0.0, f64::max);
+        sectors.retain(|s| s.per_mm >= LEAST_DENSE * densest);
+        sectors
     }
 
-    /// Mean and covariance of its errors where no cut can be made: as if the sectors erred alike.
-    fn unknown(&self, sector: f64) -> (Vector3<f64>, Matrix3<f64>) {
-        let n = self.rows.iter().map(|r| r.1).sum::<f64>();
-        (Vector3::zeros(), self.inverse * (sector * sector * n.sqrt()))
-    }
-
-    fn solve(&self, values: impl Iterator<Item = f64>) -> Vector3<f64> {
-        let sum: Vector3<f64> = self.rows.iter().zip(values).map(|((r, w), v)| r * (w * v)).sum();
-        self.inverse * sum
-    }
-
-    /// Covariance that the expectation of the slope leaves: what is drawn to 0 may not be 0.
-    fn left_open(&self, spread: f64) -> Matrix3<f64> {
-        let own: Matrix3<f64> = self.rows.iter().map(|(r, w)| r * r.transpose() * *w).sum();
-        let missed = Matrix3::identity() - self.inverse * own;
-        let prior = Matrix3::from_diagonal(&Vector3::new(0.0, spread * spread, spread * spread));
-        missed * prior * missed.transpose()
+    fn sector(&self, index: usize, mut along: Vec<f64>) -> Option<Sector> {
+        along.sort_by(f64::total_cmp);
+        let first_mm = solid_start(&along, 2.0 * self.radius_mm)?;
+        along.drain(..along.partition_point(|u| *u < first_mm));
+        if along.len() < MIN_POINTS {
+            return None;
+        }
+        let per_mm = (along.len() - 1) as f64 / (along[along.len() - 1] - first_mm).max(1e-9);
+        let depth = self.step_mm.max(3.0 * self.noise_mm);
+        let layer = ((per_mm * depth).round() as usize).clamp(1, along.len());
+        let mean = along[..layer].iter().sum::<f64>() / layer as f64;
+        let turn = ((index as f64 + 0.5) / self.count as f64 - 0.5) * std::f64::consts::TAU;
+        let row = Vector3::new(1.0, self.radius_mm * turn.cos(), self.radius_mm * turn.sin());
+        Some(Sector { index, row, first_mm, begin_mm: mean - 0.5 * layer as f64 / per_mm, per_mm })
     }
 }
 
-impl Plane {
-    /// Standard deviation of a slope by the data alone, along itself.
-    fn loose_sigma(&self, slope: &[f64; 2]) -> f64 {
-        let along = Vector3::new(0.0, slope[0], slope[1]).try_normalize(1e-12).unwrap_or_default();
-        along.dot(&(self.loose * along)).max(0.0).sqrt()
-    }
+/// The outline's plane by the data alone, and after square and mitred were weighed.
+struct Fine {
+    free: Estimate,
+    both: Weighed,
+}
 
-    /// The plane by the data alone.
-    fn loose(sectors: &[Sector], radius_mm: f64) -> Option<Vector3<f64>> {
+impl Fine {
+    /// Whether nothing speaks for a mitre, whose tip stands out as a burr does but leaves an oblique edge without it.
+    fn is_square(&self) -> bool {
+        let slope = self.free.value.y.hypot(self.free.value.z);
+        self.both.square_share > 0.5 && slope < SQUARE_SIGMAS * slope_sigma(&self.free)
+    }
+}
+
+/// The plane on which most sectors begin.
+struct Rough {
+    plane: Estimate,
+    /// The slope along which the sectors were taken.
+    base: [f64; 2],
+    sectors: Vec<Sector>,
+    /// How far each lies on the plane, 0 to 1.
+    weights: Vec<f64>,
+}
+
+impl Rough {
+    fn find(rim: &Rim, base: [f64; 2]) -> Option<Rough> {
+        let sectors = rim.sectors(base);
         if sectors.len() < MIN_SECTORS {
             return None;
         }
-        let begins: Vec<f64> = sectors.iter().filter_map(|s| s.begins(f64::NEG_INFINITY)).collect();
-        let mut value = Vector3::new(median(&mut begins.clone())?, 0.0, 0.0);
+        let middle = median(&mut sectors.iter().map(|s| s.begin_mm).collect::<Vec<_>>())?;
+        let mut value = Vector3::new(middle, 0.0, 0.0);
+        let (mut weights, mut variance) = (Vec::new(), Matrix3::zeros());
         for _ in 0..12 {
-            let off: Vec<f64> = sectors.iter().zip(&begins).map(|(s, b)| b - s.row.dot(&value)).collect();
+            let off: Vec<f64> = sectors.iter().map(|s| s.begin_mm - s.row.dot(&value)).collect();
             let mut sizes: Vec<f64> = off.iter().map(|r| r.abs()).collect();
-            let scale = (1.4826 * median(&mut sizes)?).max(1e-6 * radius_mm);
-            let weigh = |r: f64| biweight(r / (CUTOFF_SECTORS * scale));
-            let rows = sectors.iter().zip(&off).map(|(s, r)| (s.row, weigh(*r))).collect();
-            let solver = Solver::new(rows, scale * scale, LOOSE_SPREAD)?;
-            value = solver.solve(begins.iter().copied());
+            let scale = (1.4826 * median(&mut sizes)?).max(CHANCE_STEPS * rim.step_mm);
+            weights = off.iter().map(|r| biweight(r / (CUTOFF_SECTORS * scale))).collect();
+            let prior = (scale / LOOSE_SPREAD).powi(2);
+            let mut normal = Matrix3::from_diagonal(&Vector3::new(0.0, prior, prior));
+            let mut right = Vector3::zeros();
+            for (s, w) in sectors.iter().zip(&weights) {
+                normal += s.row * s.row.transpose() * *w;
+                right += s.row * (w * s.begin_mm);
+            }
+            let inverse = normal.try_inverse()?;
+            value = inverse * right;
+            // As if the sectors erred alike: stripes lie across many of them.
+            let sector = scale.max(SECTOR_STEPS_SIGMA * rim.step_mm);
+            variance = inverse * (sector * sector * weights.iter().sum::<f64>().sqrt());
         }
-        Some(value)
+        value += Vector3::new(0.0, base[0], base[1]);
+        Some(Rough { plane: Estimate { value, variance }, base, sectors, weights })
     }
 
-    /// The plane along which the sectors begin, corrected and weighed by what cuts at known places say.
-    fn fit(sectors: &[Sector], base: [f64; 2], step: f64) -> Option<Plane> {
-        let begins: Vec<f64> = sectors.iter().filter_map(|s| s.begins(f64::NEG_INFINITY)).collect();
-        if begins.len() < MIN_SECTORS || begins.len() < sectors.len() {
-            return None;
+    /// The plane by all points next to it together where that is closer; square and mitred weighed. `passes` is the covariance
+    /// of what passes disagree by.
+    fn refined(&self, edge: Option<&Edge>, passes: &Matrix3<f64>) -> Fine {
+        let slope_variance = |e: &Estimate| e.variance[(1, 1)] + e.variance[(2, 2)];
+        let closer = |e: &Estimate| slope_variance(e) < slope_variance(&self.plane);
+        let by_points = edge.and_then(|e| e.free(self.slope())).filter(closer);
+        let free = by_points.unwrap_or(self.plane);
+        let square = edge.and_then(Edge::square).unwrap_or(free);
+        let scatter = edge.filter(|_| by_points.is_some()).and_then(Edge::scatter);
+        let scatter = scatter.unwrap_or(free.variance) + passes;
+        let [free, square] = [free, square].map(|e| Estimate { variance: e.variance + passes, ..e });
+        Fine { free, both: square::weigh(&free, &square, &scatter) }
+    }
+
+    fn slope(&self) -> [f64; 2] {
+        [self.plane.value.y, self.plane.value.z]
+    }
+
+    /// Share of the sectors that stop at the plane.
+    fn agreeing(&self, step_mm: f64) -> f64 {
+        let value = self.plane.value - Vector3::new(0.0, self.base[0], self.base[1]);
+        let agrees = |s: &Sector| biweight((s.begin_mm - s.row.dot(&value)) / (AGREE_STEPS * step_mm));
+        self.sectors.iter().map(agrees).sum::<f64>() / self.sectors.len() as f64
+    }
+
+    /// The points of the sectors that stop at the plane.
+    fn edge(&self, rim: &Rim) -> Option<Edge> {
+        let mut from = vec![f64::INFINITY; rim.count];
+        for (sector, _) in self.sectors.iter().zip(&self.weights).filter(|(_, w)| **w > LEAST_WEIGHT) {
+            from[sector.index] = sector.first_mm;
         }
-        let middle = median(&mut begins.clone())?;
-        let errors = known_errors(sectors, middle, step);
-        let one = Scatter::of(&errors, step);
-        let (bias, sector) = (one.bias_mm, one.sigma_mm);
-        // What is learned from few layers of the pattern is itself uncertain.
-        let few = 1.0 + LEARNING / (errors.len() as f64 / CUTS as f64 * layers(sectors, step)).max(1.0);
-        let own = Vector3::new(0.0, base[0], base[1]);
-        // The data says base; the expectation draws the slope from there to 0.
-        let centred: Vec<f64> = begins.iter().zip(sectors).map(|(b, s)| b - bias + s.row.dot(&own)).collect();
-        let rows: Vec<Vector3<f64>> = sectors.iter().map(|s| s.row).collect();
-        // As much of the expectation as makes the whole variance least.
-        let candidates = [0.25, 1.0, 4.0, 16.0, 64.0].into_iter().filter_map(|share| {
-            let variance = share * sector * sector;
-            let (solver, value) = Solver::robust(&rows, &centred, &one, variance)?;
-            let at_cuts = |e: &Vec<f64>| {
-                let off: Vec<f64> = e.iter().map(|e| e - bias).collect();
-                Some(Solver::robust(&rows, &off, &one, variance)?.1)
-            };
-            let known: Vec<Vector3<f64>> = errors.iter().filter_map(at_cuts).collect();
-            let (mean, spread) = moments(&known).unwrap_or_else(|| solver.unknown(sector));
-            Some((value - mean, spread * few + solver.left_open(SQUARE_SPREAD), solver))
-        });
-        let (value, variance, solver) = candidates.min_by(|a, b| a.1[(0, 0)].total_cmp(&b.1[(0, 0)]))?;
-        let free = Solver::new(rows.iter().map(|r| (*r, 1.0)).collect(), sector * sector, LOOSE_SPREAD)?;
-        let known: Vec<Vector3<f64>> =
-            errors.iter().map(|e| free.solve(e.iter().map(|e| e - bias))).collect();
-        let (_, loose) = moments(&known).unwrap_or_else(|| free.unknown(sector));
-        let agreeing = solver.rows.iter().map(|r| r.1).sum::<f64>() / rows.len() as f64;
-        Some(Plane { value: value - own, variance, loose, agreeing })
+        let own = |p: &&Point3<f64>| p.x < rim.to_mm() && past(p, self.base) >= from[sector_of(p, rim.count)];
+        let points = rim.points.iter().filter(own).map(|p| [p.x, p.y, p.z]).collect();
+        Edge::new(points, rim.radius_mm, rim.step_mm)
     }
 }
 
 fn biweight(share: f64) -> f64 {
     let keep = (1.0 - share * share).max(0.0);
     keep * keep
-}
-
-/// Layers of points along the sectors.
-fn layers(sectors: &[Sector], step: f64) -> f64 {
-    let mut spans: Vec<f64> = sectors.iter().map(|s| s.along[s.along.len() - 1] - s.along[0]).collect();
-    median(&mut spans).map_or(0.0, |span| span / step)
-}
-
-/// Errors of all sectors' beginnings at cuts further inside, one row per cut.
-fn known_errors(sectors: &[Sector], begin: f64, step: f64) -> Vec<Vec<f64>> {
-    let mut lasts: Vec<f64> = sectors.iter().map(|s| s.along[s.along.len() - 1]).collect();
-    let (Some(last), from) = (median(&mut lasts), begin + step) else { return Vec::new() };
-    let to = last - 3.0 * step;
-    if to < from + 2.0 * step {
-        return Vec::new();
-    }
-    let at = |k: usize| from + (to - from) * (k as f64 + 0.5) / CUTS as f64;
-    let row = |cut: f64| -> Vec<f64> {
-        sectors.iter().map(|s| s.begins(cut).map_or(0.0, |b| (b - cut).min(4.0 * step))).collect()
-    };
-    (0..CUTS).map(|k| row(at(k))).collect()
-}
-
-/// Mean and covariance; None of nothing.
-fn moments(values: &[Vector3<f64>]) -> Option<(Vector3<f64>, Matrix3<f64>)> {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<Vector3<f64>>() / n;
-    let spread = values.iter().map(|o| (o - mean) * (o - mean).transpose()).sum::<Matrix3<f64>>() / n;
-    (n > 0.0).then_some((mean, spread))
 }

@@ -1,61 +1,86 @@
-//! How far apart the passes of a scan lie, which no file labels: neighbours in the file are nearly always neighbours in one
-//! stripe of one pass, and so differ by the scanner's noise alone; the points of one place differ by what the passes
-//! disagree besides.
+//! How far the passes of a scan disagree, from what they leave of it on the end straights.
 //!
-//! Under `structure`: what moves the tube by no more than that is no bend. Of a file in another order neighbours come from
-//! all passes, and nothing is found.
+//! Where only some of the passes saw an end, it lies where those put it, not where all together put the tube; no fit to
+//! that end's own points can tell. But the passes also disagree across the tube, and there it shows: seen from
+//! different sides, the surface lies off the fitted cylinder, here out and there in.
 
-use super::local::prepare;
-use super::model::TubeModel;
-use super::radius::median;
-use super::whole::Whole;
+use nalgebra::Point3;
 
-/// Neighbours in the file are no farther apart than this, in tube radii.
-const NEIGHBOUR_RADII: f64 = 0.35;
-/// Points looked at, in runs of so many as they lie in the file.
-const MOST_POINTS: usize = 200_000;
-const RUN: usize = 1000;
-/// Fewer pairs tell nothing.
-const LEAST_PAIRS: usize = 500;
-/// A share of the variance that is within the error of both estimates.
-const LEAST_SHARE: f64 = 0.1;
-/// Residuals beyond so many standard deviations are no tube's.
-const CUTOFF_SIGMAS: f64 = 6.0;
-/// Median of |x| to standard deviation for normal errors.
-const MEDIAN_TO_SIGMA: f64 = 1.4826;
+/// Places of a straight: so many around it, and along it one per radius.
+const SECTORS: usize = 24;
+const MOST_SLABS: usize = 40;
+/// A place with fewer points says nothing.
+const MIN_POINTS: f64 = 4.0;
+/// Points farther off than this are not of the surface, in standard deviations of the noise.
+const SURFACE_SIGMAS: f64 = 4.0;
+/// The fitted cylinder goes half the way with a pass: so much more than what is left of a displacement it was.
+const ALONG_PER_ACROSS: f64 = 2.0;
 
-/// Neighbours so far.
-#[derive(Default)]
-struct Pairs {
-    before: Option<(usize, [f64; 3], f64)>,
-    differences: Vec<f64>,
+/// Points, sum and sum of squares of their distances from the surface.
+type Place = (f64, f64, f64);
+
+/// Standard deviation of a pass's displacement along the tube. Each of `ends` holds points in a frame whose x axis is
+/// the tube's.
+pub fn disagreement_mm(ends: [&[Point3<f64>]; 2], radius_mm: f64, noise_mm: f64) -> f64 {
+    let places: Vec<Place> = ends.iter().flat_map(|points| places(points, radius_mm, noise_mm)).collect();
+    let told = || places.iter().filter(|p| p.0 >= MIN_POINTS);
+    let (within, freedom) = told().fold((0.0, 0.0), |(squares, freedom), (n, sum, square)| {
+        (squares + square - sum * sum / n, freedom + n - 1.0)
+    });
+    let own = within / f64::max(freedom, 1.0);
+    let (shared, count) = told().fold((0.0, 0.0), |(squares, count), (n, sum, _)| {
+        (squares + (sum / n).powi(2) - own / n, count + 1.0)
+    });
+    ALONG_PER_ACROSS * f64::max(shared / f64::max(count, 1.0), 0.0).sqrt()
 }
 
-/// Standard deviation of what the passes disagree across the surface, of points that scatter by `noise_mm` about their
-/// sections; 0 where nothing says that they do.
-pub fn disagreement_mm(whole: &Whole, model: &TubeModel, noise_mm: f64) -> f64 {
-    let locals = prepare(model);
-    let radius = model.tube_radius_mm;
-    let near = (NEIGHBOUR_RADII * radius).powi(2);
-    let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
-    let add = |pairs: &mut Pairs, segment: usize, p: [f64; 3]| {
-        let residual_mm = locals[segment].residual_mm(p, radius);
-        if let Some((_, q, other_mm)) = pairs.before.filter(|b| b.0 == segment) {
-            let square: f64 = p.iter().zip(&q).map(|(a, b)| (a - b) * (a - b)).sum();
-            if square < near && residual_mm.abs() < cutoff_mm && other_mm.abs() < cutoff_mm {
-                pairs.differences.push((residual_mm - other_mm).abs());
-            }
+fn places(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Vec<Place> {
+    let first = points.iter().map(|p| p.x).fold(f64::INFINITY, f64::min);
+    let mut places = vec![(0.0, 0.0, 0.0); SECTORS * MOST_SLABS];
+    for p in points {
+        let off = p.y.hypot(p.z) - radius_mm;
+        let slab = ((p.x - first) / radius_mm) as usize;
+        if off.abs() < SURFACE_SIGMAS * noise_mm && slab < MOST_SLABS {
+            let turn = p.z.atan2(p.y) / std::f64::consts::TAU + 0.5;
+            let place = &mut places[slab * SECTORS + ((turn * SECTORS as f64) as usize).min(SECTORS - 1)];
+            *place = (place.0 + 1.0, place.1 + off, place.2 + off * off);
         }
-        pairs.before = Some((segment, p, residual_mm));
-    };
-    let runs = whole.runs(RUN, MOST_POINTS);
-    let parts = whole.only(&runs).walk(model, cutoff_mm, Pairs::default, add);
-    let mut differences: Vec<f64> = parts.into_iter().flat_map(|p| p.differences).collect();
-    if differences.len() < LEAST_PAIRS {
-        return 0.0;
     }
-    // A difference has the variance of both.
-    let within = median(&mut differences).map_or(noise_mm, |m| m * MEDIAN_TO_SIGMA / 2f64.sqrt());
-    let between = noise_mm * noise_mm - within * within;
-    if between > LEAST_SHARE * noise_mm * noise_mm { between.sqrt() } else { 0.0 }
+    places
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RADIUS: f64 = 10.0;
+    const NOISE: f64 = 0.03;
+
+    /// The upper and the lower half of 100 mm of tube, the upper one displaced across the tube.
+    fn two_passes(sideways_mm: f64) -> Vec<Point3<f64>> {
+        let point = |i: i32| {
+            let i = f64::from(i);
+            let turn = std::f64::consts::TAU * (0.618_034 * i).fract();
+            let r = RADIUS + NOISE * 1.4 * (2.3 * i).sin();
+            let shift = if turn < std::f64::consts::PI { 0.5 } else { -0.5 };
+            Point3::new((0.7549 * i).fract() * 100.0, r * turn.cos() + shift * sideways_mm, r * turn.sin())
+        };
+        (0..6000).map(point).collect()
+    }
+
+    #[test]
+    fn passes_that_agree_leave_next_to_nothing() {
+        let points = two_passes(0.0);
+        assert!(disagreement_mm([&points, &points], RADIUS, NOISE) < 0.2 * NOISE);
+        assert_eq!(disagreement_mm([&[], &[]], RADIUS, NOISE), 0.0);
+    }
+
+    #[test]
+    fn what_passes_disagree_by_shows_as_much_as_it_is() {
+        for sideways in [0.03, 0.06, 0.09] {
+            let points = two_passes(sideways);
+            let found = disagreement_mm([&points, &[]], RADIUS, NOISE);
+            assert!((0.5..1.2).contains(&(found / sideways)), "{found} of {sideways}");
+        }
+    }
 }

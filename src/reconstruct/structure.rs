@@ -11,12 +11,12 @@ use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::{is_free_form, mean_radius_mm, reaching, with_common_radius, without_bend};
-use super::passes;
 use super::profile::{Held, lengths};
 use super::scene::Scene;
 use super::search::{Candidate, DOUBT, FULL_STEPS, Jury};
 use super::sections::CentreLine;
 use super::simplify::simplify;
+use super::stripes;
 use super::whole::Whole;
 use crate::cloud::PointCloud;
 use crate::tube::Decision;
@@ -123,7 +123,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
             best = jury.search(common);
         }
     }
-    let passes_mm = passes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
+    let passes_mm = stripes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
     best = jury.material(best, passes_mm);
     Some(jury.confirmed(sample, best.model))
 }

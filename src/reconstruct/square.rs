@@ -1,0 +1,160 @@
+//! What an end's plane is before it is seen: sawn square, or mitred. Both are held against the outline, and what it
+//! leaves open between them is in the sigma.
+
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
+
+/// A saw that is set square cuts this square: standard deviation of each component of the slope (0.1 degrees).
+pub const SAW_SPREAD: f64 = 0.0017;
+/// A mitre's slope, or a poor saw's (4 degrees).
+const MITRE_SPREAD: f64 = 0.07;
+/// Share of the ends that are cut square: a saw that is set for a mitre is the rarer one.
+const SQUARE_SHARE: f64 = 0.85;
+/// Share of a normal distribution within two standard deviations.
+const TWO_SIGMAS: f64 = 0.9545;
+
+/// A plane x = at + slope . (y, z) with its covariance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Where it meets the axis and its slope along y and z.
+    pub value: Vector3<f64>,
+    /// Their covariance.
+    pub variance: Matrix3<f64>,
+}
+
+/// Both expectations together.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Weighed {
+    /// Their mean, each with its share, and the covariance about it.
+    pub estimate: Estimate,
+    /// Twice this holds 95.4 % of where the plane may meet the axis. The two together are no normal distribution, and
+    /// its standard deviation would speak for a mitre even where that is all but excluded.
+    pub sigma_mm: f64,
+    /// How likely it is cut square.
+    pub square_share: f64,
+}
+
+/// Weighs a plane that was estimated freely against one that was expected to be square. `scatter` is the covariance with
+/// which an edge is estimated freely that is square: stripes that lie nearly along it draw the plane to themselves.
+pub fn weigh(free: &Estimate, square: &Estimate, scatter: &Matrix3<f64>) -> Weighed {
+    let mitred = expected(free, MITRE_SPREAD);
+    let if_square = log_likelihood(&Estimate { variance: *scatter, ..*free }, SAW_SPREAD);
+    let log_odds =
+        if_square - log_likelihood(free, MITRE_SPREAD) + (SQUARE_SHARE / (1.0 - SQUARE_SHARE)).ln();
+    let share = 1.0 / (1.0 + (-log_odds).exp());
+    let apart = square.value - mitred.value;
+    let estimate = Estimate {
+        value: mitred.value + apart * share,
+        variance: square.variance * share
+            + mitred.variance * (1.0 - share)
+            + apart * apart.transpose() * (share * (1.0 - share)),
+    };
+    let sigma_mm = 0.5 * reach_mm(&[(share, square), (1.0 - share, &mitred)], estimate.value.x);
+    Weighed { estimate, sigma_mm, square_share: share }
+}
+
+/// How far around `about_mm` 95.4 % of several normal distributions lie, each with its share.
+fn reach_mm(parts: &[(f64, &Estimate)], about_mm: f64) -> f64 {
+    let within = |reach: f64| -> f64 {
+        let one = |(share, part): &(f64, &Estimate)| {
+            let (off, sigma) = (part.value.x - about_mm, part.variance[(0, 0)].sqrt().max(1e-12));
+            share * (below((reach - off) / sigma) - below((-reach - off) / sigma))
+        };
+        parts.iter().map(one).sum()
+    };
+    let widest =
+        |(_, part): &(f64, &Estimate)| (part.value.x - about_mm).abs() + 2.0 * part.variance[(0, 0)].sqrt();
+    let (mut low, mut high) = (0.0, parts.iter().map(widest).fold(0.0, f64::max));
+    for _ in 0..30 {
+        let middle = 0.5 * (low + high);
+        *(if within(middle) < TWO_SIGMAS { &mut low } else { &mut high }) = middle;
+    }
+    high
+}
+
+/// Share of a normal distribution below so many standard deviations, to a few ten-thousandths (Hastings' polynomial).
+fn below(sigmas: f64) -> f64 {
+    let t = 1.0 / (1.0 + 0.33267 * sigmas.abs());
+    let tail = (-0.5 * sigmas * sigmas).exp() / std::f64::consts::TAU.sqrt()
+        * t
+        * (0.436_183_6 + t * (-0.120_167_6 + t * 0.937_298));
+    if sigmas > 0.0 { 1.0 - tail } else { tail }
+}
+
+/// The plane whose slope is expected within `spread` of square beforehand.
+fn expected(free: &Estimate, spread: f64) -> Estimate {
+    let gain = open(free, spread)
+        .try_inverse()
+        .map_or_else(Default::default, |inverse| free.variance.fixed_columns::<2>(1) * inverse);
+    let slope = Vector2::new(free.value.y, free.value.z);
+    Estimate {
+        value: free.value - gain * slope,
+        variance: free.variance - gain * free.variance.fixed_rows::<2>(1),
+    }
+}
+
+/// Covariance of the slope that is seen when it is expected within `spread` of square.
+fn open(free: &Estimate, spread: f64) -> Matrix2<f64> {
+    free.variance.fixed_view::<2, 2>(1, 1) + Matrix2::identity() * (spread * spread)
+}
+
+/// Of the slope that is seen; without the constant that all expectations share.
+fn log_likelihood(free: &Estimate, spread: f64) -> f64 {
+    let open = open(free, spread);
+    let slope = Vector2::new(free.value.y, free.value.z);
+    let Some(inverse) = open.try_inverse() else { return 0.0 };
+    -0.5 * (slope.dot(&(inverse * slope)) + open.determinant().ln())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plane(at: f64, slope: f64, sigmas: [f64; 2]) -> Estimate {
+        let [at_sigma, slope_sigma] = sigmas.map(|s| s * s);
+        let variance = Matrix3::from_diagonal(&Vector3::new(at_sigma, slope_sigma, slope_sigma));
+        Estimate { value: Vector3::new(at, slope, 0.0), variance }
+    }
+
+    fn weighed(free: Estimate, square: Estimate) -> Weighed {
+        weigh(&free, &square, &free.variance)
+    }
+
+    #[test]
+    fn what_looks_square_is_taken_for_square() {
+        let both = weighed(plane(5.3, 0.01, [0.3, 0.01]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
+        assert!(both.square_share > 0.98 && (both.estimate.value.x - 5.0).abs() < 0.02, "{both:?}");
+        assert!((0.05..0.06).contains(&both.sigma_mm), "{both:?}");
+    }
+
+    #[test]
+    fn a_mitre_is_taken_for_one() {
+        let both = weighed(plane(5.3, 0.1, [0.3, 0.01]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
+        assert!(both.square_share < 0.01 && (both.estimate.value.x - 5.3).abs() < 0.02, "{both:?}");
+        assert!((both.sigma_mm - 0.3).abs() < 0.01, "{both:?}");
+        assert!((both.estimate.value.y - 0.1).abs() < 0.003, "{both:?}");
+    }
+
+    #[test]
+    fn what_may_be_either_is_uncertain_by_what_lies_between() {
+        // Three sigmas from square is rare of a square cut, and mitres are rare.
+        let both = weighed(plane(6.0, 0.06, [0.1, 0.02]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
+        assert!((0.4..0.9).contains(&both.square_share), "{both:?}");
+        assert!(both.sigma_mm > 0.3, "{both:?}");
+    }
+
+    #[test]
+    fn a_slope_that_square_edges_show_too_is_no_mitre() {
+        let (free, square) = (plane(5.3, 0.06, [0.3, 0.01]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
+        assert!(weighed(free, square).square_share < 0.1);
+        let scatter = Matrix3::from_diagonal(&Vector3::new(0.1, 2e-3, 2e-3));
+        assert!(weigh(&free, &square, &scatter).square_share > 0.7);
+    }
+
+    #[test]
+    fn the_polynomial_is_the_normal_distribution() {
+        for (sigmas, share) in [(0.0, 0.5), (1.0, 0.841_345), (2.0, 0.977_250), (-1.0, 0.158_655), (9.0, 1.0)]
+        {
+            assert!((below(sigmas) - share).abs() < 1e-4, "{sigmas}");
+        }
+    }
+}
