@@ -4,10 +4,10 @@
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, Matrix6x4, SymmetricEigen, Vector3, Vector4, Vector6};
 use rayon::prelude::*;
 
-use super::fit::invert;
+use super::fit::{RadiusPrior, full_equations, invert};
 use super::model::{Motion, Parameter, TubeModel};
 use super::moments::Moment;
-use super::normal::{Part, equations, symmetric, to_segment};
+use super::normal::{Part, symmetric, to_segment};
 use super::sections::CentreLine;
 use crate::tube::{Frame, Spine};
 
@@ -39,12 +39,18 @@ pub struct Solved {
 }
 
 impl Solved {
-    /// Sums the sections about a model.
-    pub fn new(line: &CentreLine, model: &TubeModel, parameters: &[Parameter]) -> Solved {
+    /// Sums the sections about a model; with what is expected of the radii, or a bend between two sections, whose CLR
+    /// nothing tells, would leave nothing to be said of its surroundings.
+    pub fn new(
+        line: &CentreLine,
+        model: &TubeModel,
+        parameters: &[Parameter],
+        prior: Option<RadiusPrior>,
+    ) -> Solved {
         let moments = line.moments(model);
         let mut whole = vec![Moment::zeros(); 2 * model.lra.bends.len() + 1];
         moments.iter().for_each(|(k, m)| whole[*k] += m);
-        let (normal, gradient) = equations(&whole, model, parameters);
+        let (normal, gradient) = full_equations(model, &whole, parameters, &prior, line.noise_mm);
         Solved { inverse: invert(&normal), gradient, moments }
     }
 

@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::model::{Parameter, TubeModel};
-use super::moments::{Pass, Sample};
+use super::moments::{Moment, Pass, Sample};
 use super::normal::equations;
 
 /// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
@@ -149,7 +149,8 @@ pub fn polish(
     for passes in 1..=effort.steps {
         let pass = data.pass(&model, cutoff_mm);
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
-        let (mut normal, gradient) = full_equations(&model, &pass, &parameters, &effort.prior, sigma_mm);
+        let (mut normal, gradient) =
+            full_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
         for (parameter, spread) in held {
             let at = parameters.iter().position(|p| p == parameter);
             at.into_iter().for_each(|j| normal[(j, j)] += (sigma_mm / spread).powi(2));
@@ -246,7 +247,7 @@ pub fn descend(
     let mut cost = total(&model, &pass);
     let (mut passes, mut damping) = (1, NO_DAMPING);
     for taken in 0..way.steps {
-        let (normal, gradient) = full_equations(&model, &pass, parameters, &prior, way.noise_mm);
+        let (normal, gradient) = full_equations(&model, &pass.moments, parameters, &prior, way.noise_mm);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
         // since in a narrow valley damped steps are short.
         let left =
@@ -281,20 +282,20 @@ pub fn descend(
 }
 
 /// Normal equations with what is expected, and without what stands at a bound.
-fn full_equations(
+pub fn full_equations(
     model: &TubeModel,
-    pass: &Pass,
+    moments: &[Moment],
     parameters: &[Parameter],
     prior: &Option<RadiusPrior>,
     noise_mm: f64,
 ) -> (DMatrix<f64>, DVector<f64>) {
-    let (mut normal, mut gradient) = equations(&pass.moments, model, parameters);
+    let (mut normal, mut gradient) = equations(moments, model, parameters);
     for (j, off, spread) in expectations(model, parameters, prior) {
         let weight = (noise_mm / spread).powi(2);
         normal[(j, j)] += weight;
         gradient[j] += weight * off;
     }
-    freeze_at_bounds(model, parameters, &mut normal, &mut gradient);
+    hold_at_bounds(model, parameters, &mut normal, &mut gradient);
     (normal, gradient)
 }
 
@@ -317,28 +318,40 @@ fn expectations<'a>(
     })
 }
 
-/// Takes parameters that stand at a bound and would cross it out of the step.
-fn freeze_at_bounds(
+/// Whether a value stands at the lower bound of what a tube can have.
+fn is_at_bound(model: &TubeModel, parameter: Parameter) -> bool {
+    match parameter {
+        Parameter::Length(i) => model.lra.bends[i].length_mm <= 0.0,
+        Parameter::Angle(i) => model.lra.bends[i].angle_rad <= 0.0,
+        Parameter::BendRadius(i) => model.lra.bends[i].radius_mm <= model.tube_radius_mm,
+        _ => false,
+    }
+}
+
+/// Takes those values out of the equations that stand at a bound and would cross it in the step that the others take with
+/// them (each by itself may pull the other way).
+fn hold_at_bounds(
     model: &TubeModel,
     parameters: &[Parameter],
     normal: &mut DMatrix<f64>,
     gradient: &mut DVector<f64>,
 ) {
-    for (j, parameter) in parameters.iter().enumerate() {
-        let at_bound = match *parameter {
-            Parameter::Length(i) => model.lra.bends[i].length_mm <= 0.0,
-            Parameter::Angle(i) => model.lra.bends[i].angle_rad <= 0.0,
-            Parameter::BendRadius(i) => model.lra.bends[i].radius_mm <= model.tube_radius_mm,
-            _ => false,
-        };
-        // A positive gradient pulls the value down.
-        if at_bound && gradient[j] > 0.0 {
+    let mut standing: Vec<usize> =
+        (0..parameters.len()).filter(|&j| is_at_bound(model, parameters[j])).collect();
+    while !standing.is_empty() {
+        let Some(step) = damped_step(normal, gradient, NO_DAMPING) else { break };
+        let (crossing, inside): (Vec<usize>, Vec<usize>) = standing.into_iter().partition(|&j| step[j] < 0.0);
+        for &j in &crossing {
             let diagonal = normal[(j, j)].max(1e-300);
             normal.row_mut(j).fill(0.0);
             normal.column_mut(j).fill(0.0);
             normal[(j, j)] = diagonal;
             gradient[j] = 0.0;
         }
+        if crossing.is_empty() {
+            break;
+        }
+        standing = inside;
     }
 }
 

@@ -158,7 +158,7 @@ impl Guided {
             let common = fitted(&line, with_common_radius(&best.model), prior, correlation, FULL_STEPS);
             best = if common.score < best.score { common } else { best };
         }
-        let solved = Solved::new(&line, &best.model, &best.parameters);
+        let solved = Solved::new(&line, &best.model, &best.parameters, None);
         let variance = line.noise_mm.powi(2) * correlation;
         let sigmas = solved.inverse.diagonal().iter().map(|v| (v * variance).max(0.0).sqrt()).collect();
         Some(Guided { best, line, correlation, prior, part, reversed, sigmas, solved })

@@ -31,7 +31,7 @@ pub fn lengths(
     prior: Option<RadiusPrior>,
 ) -> Vec<Held> {
     let parameters = model.parameters();
-    let solved = Solved::new(line, model, &parameters);
+    let solved = Solved::new(line, model, &parameters, None);
     let unit = line.noise_mm * line.noise_mm * correlation;
     let suspect = |(j, p): (usize, &Parameter)| {
         let Parameter::Length(i) = *p else { return None };

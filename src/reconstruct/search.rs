@@ -176,7 +176,7 @@ impl Jury {
     /// What looks like error that neighbours share may be a bend that is missing. Where one more takes much of it away, both
     /// are judged by what that one leaves.
     fn explained(&mut self, best: &Candidate) -> Option<Candidate> {
-        let solved = Solved::new(&self.line, &best.model, &best.parameters);
+        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
         let joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
         let joint = joints.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain))?;
         let misfit = (best.score - self.price(best.parameters.len(), best.bends())) * self.correlation;
@@ -231,7 +231,7 @@ impl Jury {
     fn changes(&self, best: &Candidate) -> Vec<Change> {
         let model = &best.model;
         let n = model.lra.bends.len();
-        let solved = Solved::new(&self.line, model, &best.parameters);
+        let solved = Solved::new(&self.line, model, &best.parameters, self.prior);
         let variance = self.line.noise_mm.powi(2) * self.correlation;
         // How certainly a value differs from zero, in terms of the score.
         let worth = |parameter: Parameter, value: f64| {

@@ -98,7 +98,7 @@ fn a_bend_that_the_model_lacks_shows_as_a_joint_where_it_is() {
     let parameters = less.parameters();
     let noise_mm = line.noise_mm;
     let fitted = descend(&mut line, less, &parameters, None, way(noise_mm)).model;
-    let joints = Solved::new(&line, &fitted, &parameters).joints(&line, &fitted, &parameters, noise_mm);
+    let joints = Solved::new(&line, &fitted, &parameters, None).joints(&line, &fitted, &parameters, noise_mm);
     let best = joints.iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).unwrap();
     let arc = truth.spine().segments()[5];
     assert!(best.gain > 100.0, "{best:?}");
@@ -107,7 +107,7 @@ fn a_bend_that_the_model_lacks_shows_as_a_joint_where_it_is() {
     let mut line = CentreLine::measure(&points, &truth, true);
     let parameters = truth.parameters();
     let fitted = descend(&mut line, truth, &parameters, None, way(noise_mm)).model;
-    let joints = Solved::new(&line, &fitted, &parameters).joints(&line, &fitted, &parameters, noise_mm);
+    let joints = Solved::new(&line, &fitted, &parameters, None).joints(&line, &fitted, &parameters, noise_mm);
     assert!(joints.iter().all(|j| j.gain < 30.0), "{:?}", joints.iter().map(|j| j.gain).fold(0.0, f64::max));
 }
 

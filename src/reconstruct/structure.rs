@@ -38,6 +38,9 @@ const RADIUS_SPREAD: f64 = 0.3;
 /// Bends that know their own CLR to this share of it say whether there is one die: two at least, or there is nothing to test.
 const KNOWN_RADIUS: f64 = 0.1;
 
+/// How many bends' price one CLR for all may be behind before its own search.
+const DEAREST_COMMON: f64 = 8.0;
+
 /// Times that the sections are measured anew about the best tube.
 const MEASUREMENTS: usize = 4;
 
@@ -115,13 +118,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         }
     }
     if jury.knowing_their_radius(&best) > 1 {
-        let common = jury.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
-        let gain = best.score - common.score;
-        jury.decide("one CLR for all bends".to_owned(), None, gain, gain > 0.0);
-        if gain > 0.0 {
-            // With one radius neighbours may turn out to be one bend.
-            best = jury.search(common);
-        }
+        best = jury.common(best);
     }
     let passes_mm = stripes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
     best = jury.material(best, passes_mm);
@@ -138,9 +135,29 @@ fn start(polygon: &[Point3<f64>], tolerance_mm: f64, radius_mm: f64) -> Option<T
 }
 
 impl Jury {
+    /// The tube with one CLR for all bends, if that is better. With one CLR neighbours may turn out to be one bend, and a wide
+    /// one two; so it is judged after a search of its own, where it is not far behind.
+    fn common(&mut self, best: Candidate) -> Candidate {
+        let common = self.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
+        let behind = common.score - best.score;
+        let (before, correlation) = (self.decisions.clone(), self.correlation);
+        let near = behind < DEAREST_COMMON * self.price(5, 1);
+        let searched = if near { self.search(common) } else { common };
+        let (searched, best_now) = (self.judge(searched.model), self.judge(best.model.clone()));
+        let gain = best_now.score - searched.score;
+        let what = "one CLR for all bends".to_owned();
+        if gain > 0.0 {
+            self.decide(what, None, gain, true);
+            return searched;
+        }
+        (self.decisions, self.correlation) = (before, correlation);
+        self.decide(what, None, gain, false);
+        best
+    }
+
     /// Bends that know their own CLR.
     fn knowing_their_radius(&self, best: &Candidate) -> usize {
-        let solved = Solved::new(&self.line, &best.model, &best.parameters);
+        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
         let variance = self.line.noise_mm.powi(2) * self.correlation;
         let knows = |(j, p): (usize, &Parameter)| match p {
             Parameter::BendRadius(i) => {
