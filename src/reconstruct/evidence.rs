@@ -4,7 +4,7 @@
 use nalgebra::{DMatrix, DVector, Matrix4, Matrix6, Matrix6x4, SymmetricEigen, Vector3, Vector4, Vector6};
 use rayon::prelude::*;
 
-use super::fit::{RadiusPrior, full_equations, invert};
+use super::fit::{RadiusPrior, expectant_equations, invert};
 use super::model::{Motion, Parameter, TubeModel};
 use super::moments::Moment;
 use super::normal::{Part, symmetric, to_segment};
@@ -50,7 +50,7 @@ impl Solved {
         let moments = line.moments(model);
         let mut whole = vec![Moment::zeros(); 2 * model.lra.bends.len() + 1];
         moments.iter().for_each(|(k, m)| whole[*k] += m);
-        let (normal, gradient) = full_equations(model, &whole, parameters, &prior, line.noise_mm);
+        let (normal, gradient) = expectant_equations(model, &whole, parameters, &prior, line.noise_mm);
         Solved { inverse: invert(&normal), gradient, moments }
     }
 

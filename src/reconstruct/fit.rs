@@ -150,7 +150,7 @@ pub fn polish(
         let pass = data.pass(&model, cutoff_mm);
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
         let (mut normal, gradient) =
-            full_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
+            bounded_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
         for (parameter, spread) in held {
             let at = parameters.iter().position(|p| p == parameter);
             at.into_iter().for_each(|j| normal[(j, j)] += (sigma_mm / spread).powi(2));
@@ -247,7 +247,7 @@ pub fn descend(
     let mut cost = total(&model, &pass);
     let (mut passes, mut damping) = (1, NO_DAMPING);
     for taken in 0..way.steps {
-        let (normal, gradient) = full_equations(&model, &pass.moments, parameters, &prior, way.noise_mm);
+        let (normal, gradient) = bounded_equations(&model, &pass.moments, parameters, &prior, way.noise_mm);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
         // since in a narrow valley damped steps are short.
         let left =
@@ -282,7 +282,20 @@ pub fn descend(
 }
 
 /// Normal equations with what is expected, and without what stands at a bound.
-pub fn full_equations(
+fn bounded_equations(
+    model: &TubeModel,
+    moments: &[Moment],
+    parameters: &[Parameter],
+    prior: &Option<RadiusPrior>,
+    noise_mm: f64,
+) -> (DMatrix<f64>, DVector<f64>) {
+    let (mut normal, mut gradient) = expectant_equations(model, moments, parameters, prior, noise_mm);
+    hold_at_bounds(model, parameters, &mut normal, &mut gradient);
+    (normal, gradient)
+}
+
+/// Normal equations with what is expected.
+pub fn expectant_equations(
     model: &TubeModel,
     moments: &[Moment],
     parameters: &[Parameter],
@@ -295,7 +308,6 @@ pub fn full_equations(
         normal[(j, j)] += weight;
         gradient[j] += weight * off;
     }
-    hold_at_bounds(model, parameters, &mut normal, &mut gradient);
     (normal, gradient)
 }
 
