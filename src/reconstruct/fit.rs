@@ -230,6 +230,82 @@ const MOST_DAMPING: f64 = 1e6;
 /// Share of a value's standard deviation that is not worth another step.
 const RESOLVED: f64 = 0.03;
 
+/// A step that gains less than this share of what an undamped one promises leads nowhere.
+const LEAST_SHARE: f64 = 1e-4;
+
+/// Steps beyond a place where none leads down, and times that they are tried.
+const LEAP_STEPS: usize = 6;
+const LEAPS: usize = 3;
+
+/// What a descent goes by.
+struct Course<'a, D: Data> {
+    data: &'a mut D,
+    parameters: &'a [Parameter],
+    prior: Option<RadiusPrior>,
+    way: Way,
+    passes: usize,
+}
+
+/// A place on the way.
+struct Stand {
+    model: TubeModel,
+    pass: Pass,
+    /// The data's and the expectations' together.
+    cost: f64,
+}
+
+impl<D: Data> Course<'_, D> {
+    fn stand(&mut self, model: TubeModel) -> Stand {
+        self.passes += 1;
+        let pass = self.data.pass(&model, self.way.cutoff_mm);
+        let off =
+            expectations(&model, self.parameters, &self.prior).map(|(_, off, spread)| (off / spread).powi(2));
+        let cost = pass.cost + 0.5 * self.way.noise_mm * self.way.noise_mm * off.sum::<f64>();
+        Stand { model, pass, cost }
+    }
+
+    fn equations(&self, at: &Stand) -> (DMatrix<f64>, DVector<f64>) {
+        bounded_equations(&at.model, &at.pass.moments, self.parameters, &self.prior, self.way.noise_mm)
+    }
+
+    /// The first step of rising damping that leads down.
+    fn downhill(
+        &mut self,
+        at: &Stand,
+        equations: &(DMatrix<f64>, DVector<f64>),
+        damping: &mut f64,
+    ) -> Option<Stand> {
+        while *damping < MOST_DAMPING {
+            if let Some(step) = damped_step(&equations.0, &equations.1, *damping) {
+                let next = self.stand(at.model.stepped(self.parameters, &step));
+                if next.cost < at.cost {
+                    *damping = (*damping * 0.1).max(NO_DAMPING);
+                    return Some(next);
+                }
+            }
+            *damping *= 10.0;
+        }
+        None
+    }
+
+    /// Undamped steps, up or down, until one stands lower than where no step led down: the derivatives leave out how a
+    /// section's ovality grows along the tube, and so point a little past the way that the cost takes.
+    fn leap(&mut self, from: &Stand) -> Option<Stand> {
+        let mut at = None::<Stand>;
+        for _ in 0..LEAP_STEPS {
+            let here = at.as_ref().unwrap_or(from);
+            let (normal, gradient) = self.equations(here);
+            let step = damped_step(&normal, &gradient, NO_DAMPING)?;
+            let next = self.stand(here.model.stepped(self.parameters, &step));
+            if next.cost < from.cost {
+                return Some(next);
+            }
+            at = Some(next);
+        }
+        None
+    }
+}
+
 /// Levenberg-Marquardt from a starting model.
 pub fn descend(
     data: &mut impl Data,
@@ -238,47 +314,36 @@ pub fn descend(
     prior: Option<RadiusPrior>,
     way: Way,
 ) -> Descent {
-    let total = |model: &TubeModel, pass: &Pass| {
-        let off = expectations(model, parameters, &prior).map(|(_, off, spread)| (off / spread).powi(2));
-        pass.cost + 0.5 * way.noise_mm * way.noise_mm * off.sum::<f64>()
-    };
-    let mut model = start;
-    let mut pass = data.pass(&model, way.cutoff_mm);
-    let mut cost = total(&model, &pass);
-    let (mut passes, mut damping) = (1, NO_DAMPING);
+    let mut course = Course { data, parameters, prior, way, passes: 0 };
+    let mut at = course.stand(start);
+    let (mut damping, mut leaps, mut stop) = (NO_DAMPING, 0, Stop::Iterations);
     for taken in 0..way.steps {
-        let (normal, gradient) = bounded_equations(&model, &pass.moments, parameters, &prior, way.noise_mm);
+        let equations = course.equations(&at);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
         // since in a narrow valley damped steps are short.
-        let left =
-            damped_step(&normal, &gradient, NO_DAMPING).map_or(f64::INFINITY, |step| -gradient.dot(&step));
+        let left = damped_step(&equations.0, &equations.1, NO_DAMPING)
+            .map_or(f64::INFINITY, |step| -equations.1.dot(&step));
         if left < (RESOLVED * way.noise_mm).powi(2) {
-            return Descent { model, pass, passes, stop: Stop::Converged };
+            stop = Stop::Converged;
+            break;
         }
-        let mut gained = None;
-        while damping < MOST_DAMPING {
-            let Some(step) = damped_step(&normal, &gradient, damping) else {
-                damping *= 10.0;
-                continue;
-            };
-            let next = model.stepped(parameters, &step);
-            let next_pass = data.pass(&next, way.cutoff_mm);
-            let next_cost = total(&next, &next_pass);
-            passes += 1;
-            if next_cost < cost {
-                gained = Some(cost - next_cost);
-                (model, pass, cost) = (next, next_pass, next_cost);
-                damping = (damping * 0.1).max(NO_DAMPING);
+        let next = course.downhill(&at, &equations, &mut damping);
+        let gain = next.as_ref().map_or(0.0, |next| at.cost - next.cost);
+        at = next.unwrap_or(at);
+        let promised = if left.is_finite() { left } else { 0.0 };
+        if gain <= LEAST_SHARE * promised {
+            let leapt = if leaps < LEAPS { course.leap(&at) } else { None };
+            let Some(leapt) = leapt else {
+                stop = Stop::Stalled;
                 break;
-            }
-            damping *= 10.0;
-        }
-        let Some(gain) = gained else { return Descent { model, pass, passes, stop: Stop::Stalled } };
-        if taken >= PATIENCE && cost - HOPE * gain > way.goal {
-            return Descent { model, pass, passes, stop: Stop::Hopeless };
+            };
+            (at, damping, leaps) = (leapt, NO_DAMPING, leaps + 1);
+        } else if taken >= PATIENCE && at.cost - HOPE * gain > way.goal {
+            stop = Stop::Hopeless;
+            break;
         }
     }
-    Descent { model, pass, passes, stop: Stop::Iterations }
+    Descent { model: at.model, pass: at.pass, passes: course.passes, stop }
 }
 
 /// Normal equations with what is expected, and without what stands at a bound.

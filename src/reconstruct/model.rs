@@ -80,7 +80,7 @@ pub struct Column {
 }
 
 /// A bend whose arc is shorter than this, in tube radii, is not long enough to become oval: between its ramps nothing is left.
-const SHORTEST_OVAL_RADII: f64 = 0.7;
+const SHORTEST_OVAL_RADII: f64 = 0.4;
 
 /// Ovality beyond this share of the radius is no bent tube's any more.
 const MOST_OVAL: f64 = 0.15;

@@ -212,6 +212,11 @@ pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
     Some(out)
 }
 
+/// The tube with all bends that are much wider than the others as two.
+pub fn with_wide_doubled(model: &TubeModel) -> TubeModel {
+    (0..model.lra.bends.len()).rev().fold(model.clone(), |out, i| doubled(&out, i).unwrap_or(out))
+}
+
 /// The tube with the shallow bend that a joint asks for. Where the joint lies on (or near the end of) an arc the
 /// straights beside it are tried.
 pub fn with_bend(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {

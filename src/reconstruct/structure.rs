@@ -10,7 +10,9 @@ use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
-use super::moves::{is_free_form, mean_radius_mm, reaching, with_common_radius, without_bend};
+use super::moves::{
+    is_free_form, mean_radius_mm, reaching, with_common_radius, with_wide_doubled, without_bend,
+};
 use super::profile::{Held, lengths};
 use super::scene::Scene;
 use super::search::{Candidate, DOUBT, FULL_STEPS, Jury};
@@ -39,7 +41,7 @@ const RADIUS_SPREAD: f64 = 0.3;
 const KNOWN_RADIUS: f64 = 0.1;
 
 /// How many bends' price one CLR for all may be behind before its own search.
-const DEAREST_COMMON: f64 = 8.0;
+const DEAREST_COMMON: f64 = 20.0;
 
 /// Times that the sections are measured anew about the best tube.
 const MEASUREMENTS: usize = 4;
@@ -138,7 +140,9 @@ impl Jury {
     /// The tube with one CLR for all bends, if that is better. With one CLR neighbours may turn out to be one bend, and a wide
     /// one two; so it is judged after a search of its own, where it is not far behind.
     fn common(&mut self, best: Candidate) -> Candidate {
-        let common = self.fit(&with_common_radius(&best.model), FULL_STEPS, f64::INFINITY);
+        let starts = [best.model.clone(), with_wide_doubled(&best.model)];
+        let fitted = starts.iter().map(|m| self.fit(&with_common_radius(m), FULL_STEPS, f64::INFINITY));
+        let Some(common) = fitted.min_by(|a, b| a.score.total_cmp(&b.score)) else { return best };
         let behind = common.score - best.score;
         let (before, correlation) = (self.decisions.clone(), self.correlation);
         let near = behind < DEAREST_COMMON * self.price(5, 1);
