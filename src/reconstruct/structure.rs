@@ -104,8 +104,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     let clearest = fitted.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
     jury.prior = radius_prior(&clearest.model);
     jury.correlation = jury.line.correlation(&clearest.model);
-    let mut best =
-        fitted.iter().map(|c| jury.judge(c.model.clone())).min_by(|a, b| a.score.total_cmp(&b.score))?;
+    let mut best = jury.judge(clearest.model.clone());
     for _ in 0..MEASUREMENTS {
         best.model = reaching(&best.model, sample);
         jury.line = CentreLine::measure(sample, &best.model, true);
