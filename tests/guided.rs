@@ -250,7 +250,7 @@ fn another_part_is_called_so_and_measured_as_it_is() {
 #[test]
 fn a_bend_too_shallow_for_the_scan_alone_is_kept_with_an_honest_sigma() {
     let mut part = frame_tube();
-    part.lra.bends.insert(2, bend(15.0, 70.0, 1.25));
+    part.lra.bends.insert(2, bend(15.0, 70.0, 1.1));
     part.lra.bends[3].length_mm = 15.0;
     let settings = ScanSettings { noise_mm: 0.4, density: Density::Points(3_000), ..ScanSettings::default() };
     let (mut unseen, mut lost, mut off) = (0, 0, Vec::new());
@@ -265,7 +265,7 @@ fn a_bend_too_shallow_for_the_scan_alone_is_kept_with_an_honest_sigma() {
             continue;
         }
         let shallow = found.measured.bends[2];
-        off.push((shallow.angle_rad - 1.25f64.to_radians()) / shallow.angle_sigma_rad);
+        off.push((shallow.angle_rad - 1.1f64.to_radians()) / shallow.angle_sigma_rad);
         unseen += usize::from(!seen && has(&found, "bend 3 rests on the nominal"));
     }
     assert!(

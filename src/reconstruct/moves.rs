@@ -20,6 +20,9 @@ const SHALLOW_RAD: f64 = 0.35;
 /// Pairs of bends tried as one per round.
 const PAIRS: usize = 4;
 
+/// A straight no longer than this, in tube radii, is none.
+const NO_STRAIGHT: f64 = 0.05;
+
 /// A bend this much wider than the mean may be two.
 const WIDE: f64 = 1.3;
 
@@ -209,6 +212,22 @@ pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
     out.lra.bends[i] = half;
     out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
     out.ovality_mm.insert(i, 0.0);
+    Some(out)
+}
+
+/// Bends the other way with no straight between, drawn apart by a tube radius; both arcs give way. A straight at its least
+/// length is a trap: both angles and the CLR have grown to make up for it. None for other bends.
+pub fn drawn_apart(model: &TubeModel, i: usize) -> Option<TubeModel> {
+    let radius = model.tube_radius_mm;
+    let other_way = model.lra.bends[i].rotation_rad.abs() > std::f64::consts::FRAC_PI_2;
+    if i == 0 || !other_way || model.lra.bends[i].length_mm > NO_STRAIGHT * radius {
+        return None;
+    }
+    let mut out = model.clone();
+    let pair = &mut out.lra.bends[i - 1..=i];
+    let arcs = pair[0].radius_mm + pair[1].radius_mm;
+    pair.iter_mut().for_each(|b| b.angle_rad = (b.angle_rad - radius / arcs).max(0.0));
+    pair[1].length_mm += radius;
     Some(out)
 }
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::evidence::{Joint, Solved};
 use super::fit::{Descent, RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
-use super::moves::{doubled, likeliest_pairs, merged, split, with_bend, without_bend};
+use super::moves::{doubled, drawn_apart, likeliest_pairs, merged, split, with_bend, without_bend};
 use super::sections::CentreLine;
 use crate::tube::Decision;
 
@@ -264,7 +264,11 @@ impl Jury {
             let what = format!("the wide bend at {:.0} mm made two of the usual CLR", at(i));
             Some(change(what, Some(i), doubled(model, i)?))
         });
-        let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled);
+        let apart = (1..n).filter_map(|i| {
+            let what = format!("the bends at {:.0} and {:.0} mm drawn apart", at(i - 1), at(i));
+            Some(change(what, Some(i), drawn_apart(model, i)?))
+        });
+        let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled).chain(apart);
         all.filter(|c| c.model.lra.bends.len() <= MOST_BENDS).collect()
     }
 

@@ -4,9 +4,9 @@ use nalgebra::{DVector, Point3, Vector3};
 use proptest::prelude::*;
 
 use super::evidence::Solved;
-use super::fit::{Data, Way, descend};
-use super::model::TubeModel;
-use super::moves::{merged, without_bend};
+use super::fit::{Data, RadiusPrior, Way, descend};
+use super::model::{Parameter, TubeModel};
+use super::moves::{doubled, drawn_apart, merged, reaching, with_wide_doubled, without_bend};
 use super::normal;
 use super::sections::CentreLine;
 use crate::tube::{Bend, Frame, Lra};
@@ -136,4 +136,83 @@ fn shallow_bends_in_two_planes_merge_into_their_joint_turn() {
     assert!((one.spine().length_mm() - model.spine().length_mm()).abs() < 1e-9);
     let (a, b) = (one.spine(), model.spine());
     assert!((a.point_at(a.length_mm()) - b.point_at(b.length_mm())).norm() < 1.5);
+}
+
+#[test]
+fn end_straights_reach_as_far_as_their_points() {
+    let whole = tube(vec![bend(100.0, 0.0, 1.2), bend(60.0, 1.0, 0.9)]);
+    let mut points = points(&whole, 0.03);
+    // Flying points beyond the end are no tube.
+    let spine = whole.spine();
+    points.extend([15.0, 40.0].map(|x| spine.frame_at(spine.length_mm()) * Point3::new(x, 10.0, 0.0)));
+    let mut short = whole.clone();
+    short.lra.last_length_mm -= 70.0;
+    short.lra.bends[0].length_mm -= 40.0;
+    short.start *= Frame::translation(40.0, 0.0, 0.0);
+    let out = reaching(&short, &points);
+    let at = [(0.0, 0.0), (out.spine().length_mm(), spine.length_mm())];
+    for (found, right) in at {
+        let off = (out.spine().point_at(found) - spine.point_at(right)).norm();
+        assert!(off <= 5.0, "half a radius at most: {off}");
+    }
+    assert_eq!(out.lra.bends[1], short.lra.bends[1], "what lies between stays");
+}
+
+#[test]
+fn all_wide_bends_are_doubled_and_no_others() {
+    let mut model = tube(vec![bend(100.0, 0.0, 1.2), bend(60.0, 1.0, 0.08), bend(45.0, -0.7, 1.1)]);
+    model.lra.bends[1].radius_mm = 400.0;
+    let out = with_wide_doubled(&model);
+    assert_eq!(out.lra.bends.len(), 4);
+    assert_eq!(Some(out), doubled(&model, 1));
+    assert_eq!(with_wide_doubled(&without_bend(&model, 1)).lra.bends.len(), 2);
+}
+
+#[test]
+fn arcs_that_are_all_ramp_are_round_by_rule() {
+    // 0.4 radii of 10 mm on a CLR of 40: 0.1 rad.
+    for (angle, oval) in [(0.099, false), (0.101, true)] {
+        let mut model = tube(vec![bend(100.0, 0.0, angle)]);
+        model.ovality_mm = vec![-0.2];
+        let free = model.parameters().contains(&Parameter::Ovality(0));
+        assert_eq!((free, model.may_be_oval(0)), (oval, oval));
+        assert_eq!(model.settled().ovality_mm[0] != 0.0, oval);
+    }
+}
+
+#[test]
+fn a_straight_of_nothing_is_a_trap_that_drawing_apart_leaves() {
+    let mut truth = tube(vec![bend(100.0, 0.0, 0.9), bend(6.0, std::f64::consts::PI, 1.3)]);
+    truth.common_radius = true;
+    let points = points(&truth, 0.02);
+    let mut line = CentreLine::measure(&points, &truth, true);
+    let mut start = truth.clone();
+    start.lra.bends[1].length_mm = 0.0;
+    start.lra.bends.iter_mut().for_each(|b| b.angle_rad += 0.07);
+    let mut descended = |start| descend(&mut line, start, &truth.parameters(), None, way(0.02));
+    let trapped = descended(start);
+    assert_eq!(trapped.model.lra.bends[1].length_mm, 0.0);
+    let found = descended(drawn_apart(&trapped.model, 1).unwrap());
+    assert!((found.model.lra.bends[1].length_mm - 6.0).abs() < 1.0, "{:?}", found.model.lra);
+    assert!(found.pass.cost < trapped.pass.cost);
+    assert_eq!(drawn_apart(&truth, 1), None, "they are apart");
+    assert_eq!(drawn_apart(&truth, 0), None);
+}
+
+#[test]
+fn a_second_bend_of_an_s_shows_beside_one_whose_radius_nothing_tells() {
+    // Hard 280: the first bend between two sections, its CLR at the bound.
+    let truth = tube(vec![bend(90.0, 0.0, 0.082), bend(20.0, std::f64::consts::PI, 0.032)]);
+    let points = points(&truth, 0.03);
+    let mut less = without_bend(&truth, 1);
+    less.lra.bends[0].radius_mm = 15.0;
+    let mut line = CentreLine::measure(&points, &less, false);
+    let parameters = less.parameters();
+    let prior = Some(RadiusPrior { radius_mm: 15.0, spread_mm: 5.0 });
+    let noise_mm = line.noise_mm;
+    let fitted = descend(&mut line, less, &parameters, prior, way(noise_mm)).model;
+    let solved = Solved::new(&line, &fitted, &parameters, prior);
+    let joints = solved.joints(&line, &fitted, &parameters, noise_mm);
+    let best = joints.iter().map(|j| j.gain).fold(0.0, f64::max);
+    assert!(best > 300.0, "{best}");
 }

@@ -59,3 +59,62 @@ pub fn disagreement_mm(whole: &Whole, model: &TubeModel, noise_mm: f64) -> f64 {
     let between = noise_mm * noise_mm - within * within;
     if between > LEAST_SHARE * noise_mm * noise_mm { between.sqrt() } else { 0.0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::PointCloud;
+    use crate::tube::{Frame, Lra};
+    use nalgebra::Point3;
+
+    const RADIUS: f64 = 10.0;
+    const NOISE: f64 = 0.03;
+
+    fn straight() -> TubeModel {
+        TubeModel::round(Frame::identity(), Lra { bends: Vec::new(), last_length_mm: 100.0 }, RADIUS)
+    }
+
+    /// Two passes, each in stripes over half of the tube, one off by as much out as the other in.
+    fn passes(apart_mm: f64) -> Vec<Point3<f64>> {
+        let mut state = 7_u64;
+        let mut next = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+        };
+        let mut points = Vec::new();
+        for pass in [-1.0, 1.0] {
+            for stripe in 0..100 {
+                for k in 0..60 {
+                    // Near enough to normal: the sum of twelve uniform numbers.
+                    let off = NOISE * (0..12).map(|_| next()).sum::<f64>() + pass * apart_mm;
+                    let turn = 0.05 * f64::from(k);
+                    let r = RADIUS + off;
+                    points.push(Point3::new(f64::from(stripe), r * turn.cos(), r * turn.sin()));
+                }
+            }
+        }
+        points
+    }
+
+    fn found_mm(points: &[Point3<f64>], noise_mm: f64) -> f64 {
+        let cloud = PointCloud::from_points(points);
+        disagreement_mm(&Whole::new(&cloud, None), &straight(), noise_mm)
+    }
+
+    #[test]
+    fn what_passes_disagree_shows_beside_the_scanners_noise() {
+        assert_eq!(found_mm(&passes(0.0), NOISE), 0.0);
+        for apart in [0.02, 0.04, 0.08] {
+            let found = found_mm(&passes(apart), NOISE.hypot(apart));
+            assert!((found / apart - 1.0).abs() < 0.15, "{found} of {apart}");
+        }
+    }
+
+    #[test]
+    fn a_file_in_another_order_tells_nothing() {
+        let points = passes(0.04);
+        let mixed: Vec<Point3<f64>> = (0..points.len()).map(|i| points[i * 7919 % points.len()]).collect();
+        assert_eq!(found_mm(&mixed, NOISE.hypot(0.04)), 0.0);
+        assert_eq!(found_mm(&points[..100], NOISE), 0.0, "too few");
+    }
+}
