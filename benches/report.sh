@@ -24,10 +24,10 @@ half_width() {
 # Median of user and system time and the peak memory over the file's size, of five runs.
 program() {
     for _ in 1 2 3 4 5; do
-        /usr/bin/time -f '%U %S %M' target/release/benderd reconstruct "target/bench/$1.ply" 2>&1 >/dev/null
-    done | awk -v bytes="$(stat -c %s "target/bench/$1.ply")" '
-        { cpu[NR] = $1 + $2; if ($3 > peak) peak = $3 }
-        END { n = asort(cpu); printf "| %.2f s | %.1f MB | %.1f MB (%.1f x) |", cpu[int(n / 2) + 1], bytes / 1e6,
+        /usr/bin/time -f '%U %S %M' target/release/benderd reconstruct "target/bench/$1.ply" 2>&1 >/dev/null | tail -1
+    done | awk '{ print $1 + $2, $3 }' | sort -n | awk -v bytes="$(stat -c %s "target/bench/$1.ply")" '
+        { cpu[NR] = $1; if ($2 > peak) peak = $2 }
+        END { printf "| %.2f s | %.1f MB | %.1f MB (%.1f x) |", cpu[int(NR / 2) + 1], bytes / 1e6,
               peak * 1.024e-3, peak * 1024 / bytes }'
 }
 
@@ -55,7 +55,7 @@ TEXT
     for n in "${sizes[@]}"; do
         printf '| %s |' "$n"
         for stage in "${stages[@]}"; do
-            printf ' %s ±%s ms |' "$(median "${stage// /_}" "$n")" "$(half_width "${stage// /_}" "$n")"
+            printf ' %s ±%s ms |' "$(median "$stage" "$n")" "$(half_width "$stage" "$n")"
         done
         printf '\n'
     done

@@ -27,9 +27,10 @@ const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 const LEAST_USED_SHARE: f64 = 0.5;
 
 /// Of larger clouds only so much of the end straights is looked at for the ends, in tube radii: a little more than the
-/// ends ask for.
+/// ends ask for at most, less where that holds more points than tell the scan's pattern.
 const MANY_POINTS: usize = 100_000;
-const END_RADII: f64 = 8.5;
+const END_RADII: std::ops::RangeInclusive<f64> = 2.5..=8.5;
+const END_POINTS: f64 = 60_000.0;
 
 /// Fits and measures the tube. A bend at one of its ends whose angle the points do not tell is a few points of
 /// something that touches the tube there, a jaw or a lip: it is left out, and that end's length is not known.
@@ -124,12 +125,14 @@ fn end_points(whole: &Whole, sample: Vec<Point3<f64>>, fit: &Fit) -> Sample {
         return whole.ends(&fit.model, fit.cutoff_mm, f64::INFINITY, f64::INFINITY);
     }
     let mut sample = Sample::new(sample, &fit.model);
-    let (first_mm, last_mm) = reaches(&mut sample, &fit.model);
+    let per_radius = whole.len() as f64 * fit.model.tube_radius_mm / fit.model.spine().length_mm();
+    let radii = (END_POINTS / per_radius).clamp(*END_RADII.start(), *END_RADII.end());
+    let (first_mm, last_mm) = reaches(&mut sample, &fit.model, radii * fit.model.tube_radius_mm);
     whole.ends(&fit.model, fit.cutoff_mm, first_mm, last_mm)
 }
 
-/// How far along the end straights, from the model's ends, points show the tube's ends.
-fn reaches(sample: &mut Sample, model: &TubeModel) -> (f64, f64) {
+/// How far along the end straights, from the model's ends, points show the tube's ends: `reach_mm` beyond the first of them.
+fn reaches(sample: &mut Sample, model: &TubeModel, reach_mm: f64) -> (f64, f64) {
     let spine = model.spine();
     let last = spine.segments().len() - 1;
     let reach = |segment: usize, along: &dyn Fn(f64) -> f64| {
@@ -138,7 +141,7 @@ fn reaches(sample: &mut Sample, model: &TubeModel) -> (f64, f64) {
         let mut places: Vec<f64> = mine.map(|(p, _)| along((inverse * p).x)).collect();
         places.sort_by(f64::total_cmp);
         let first = solid_start(&places, 2.0 * model.tube_radius_mm);
-        first.map_or(f64::INFINITY, |at| at + END_RADII * model.tube_radius_mm)
+        first.map_or(f64::INFINITY, |at| at + reach_mm)
     };
     let length_mm = spine.segments()[last].length_mm;
     (reach(0, &|x| x), reach(last, &|x| length_mm - x))
