@@ -201,20 +201,22 @@ impl Jury {
 
     /// The tube without the bends that move it by no more than its scan's passes disagree.
     pub(super) fn material(&mut self, mut best: Candidate, passes_mm: f64) -> Candidate {
-        while passes_mm > 0.0 {
+        if passes_mm <= 0.0 {
+            return best;
+        }
+        loop {
             let dearest = best.score + DEAREST_NONE * self.price(5, 1);
             let fewer = self.changes(&best).into_iter().filter(|c| c.model.lra.bends.len() < best.bends());
             let fitted = fewer.map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
             let none = fitted.filter(|(c, _)| {
                 c.score < dearest && self.line.apart_mm(&best.model, &c.model) < ABOVE_PASSES * passes_mm
             });
-            let Some((less, what)) = none.min_by(|a, b| a.0.score.total_cmp(&b.0.score)) else { break };
+            let Some((less, what)) = none.min_by(|a, b| a.0.score.total_cmp(&b.0.score)) else { return best };
             let um = 1e3 * passes_mm;
             let what = format!("{what}: it moves the tube by no more than the passes disagree ({um:.0} um)");
             self.decide(what, None, best.score - less.score, true);
             best = less;
         }
-        best
     }
 
     /// All changes by one bend that may be worth it, each fitted.
