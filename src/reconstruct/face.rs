@@ -5,7 +5,7 @@
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use super::radius::median;
+use super::radius::{MEDIAN_TO_SIGMA, median};
 
 /// Trial planes, and most points that vote on them.
 const TRIALS: usize = 400;
@@ -104,7 +104,7 @@ fn agreeing_sectors(points: &[Point3<f64>], plane: &Vector3<f64>, scale_mm: f64)
     let normed = sums.map(|(n, sum)| if n > 0.0 { sum / (scale_mm * n.sqrt()) } else { 0.0 });
     let mut sizes: Vec<f64> =
         normed.iter().zip(&sums).filter(|(_, s)| s.0 > 0.0).map(|(z, _)| z.abs()).collect();
-    let typical = (1.4826 * median(&mut sizes).unwrap_or(0.0)).max(1.0);
+    let typical = (MEDIAN_TO_SIGMA * median(&mut sizes).unwrap_or(0.0)).max(1.0);
     let keep = normed.map(|z| z.abs() < SECTOR_SIGMAS * typical);
     let kept = normed.iter().zip(&sums).filter(|(z, s)| s.0 > 0.0 && z.abs() < SECTOR_SIGMAS * typical);
     let (n, squares) = kept.fold((0.0, 0.0), |(n, sum), (z, _)| (n + 1.0, sum + z * z));
@@ -193,7 +193,7 @@ fn refine(
 /// Standard deviation of the points about the plane, from the median of their distances.
 fn spread(points: &[Point3<f64>], plane: &Vector3<f64>, noise_mm: f64) -> f64 {
     let mut sizes: Vec<f64> = on_plane(points, plane, 4.0 * noise_mm).map(|p| off(p, plane).abs()).collect();
-    median(&mut sizes).map_or(noise_mm, |m| 1.4826 * m)
+    median(&mut sizes).map_or(noise_mm, |m| MEDIAN_TO_SIGMA * m)
 }
 
 /// Points on the plane in each sixth of the ring.

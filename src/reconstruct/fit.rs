@@ -6,12 +6,10 @@ use nalgebra::{DMatrix, DVector};
 use super::model::{Parameter, TubeModel};
 use super::moments::{Moment, Pass, Sample};
 use super::normal::equations;
+use super::radius::MEDIAN_TO_SIGMA;
 
 /// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
 pub const CUTOFF_SIGMAS: f64 = 6.0;
-
-/// Median of |x| to standard deviation for normal errors.
-const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
 /// Why the solver stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -149,13 +147,13 @@ pub fn polish(
     for passes in 1..=effort.steps {
         let pass = data.pass(&model, cutoff_mm);
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
-        let (mut normal, gradient) =
-            bounded_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
+        let all = expectant_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
+        let (mut normal, gradient) = held_at_bounds(&model, &parameters, all);
         for (parameter, spread) in held {
             let at = parameters.iter().position(|p| p == parameter);
             at.into_iter().for_each(|j| normal[(j, j)] += (sigma_mm / spread).powi(2));
         }
-        let step = damped_step(&normal, &gradient, 1e-12)? * pass.shortfall();
+        let step = damped_step(&normal, &gradient, NO_DAMPING)? * pass.shortfall();
         let variance = pass.variance_mm2(parameters.len());
         let size = -gradient.dot(&step) / variance.max(1e-300);
         let next_cutoff_mm = (CUTOFF_SIGMAS * sigma_mm).min(cutoff_mm);
@@ -237,8 +235,8 @@ const LEAST_SHARE: f64 = 1e-4;
 const LEAP_STEPS: usize = 6;
 const LEAPS: usize = 3;
 
-/// What a descent goes by.
-struct Course<'a, D: Data> {
+/// What a descent goes over.
+struct Ground<'a, D: Data> {
     data: &'a mut D,
     parameters: &'a [Parameter],
     prior: Option<RadiusPrior>,
@@ -254,7 +252,7 @@ struct Stand {
     cost: f64,
 }
 
-impl<D: Data> Course<'_, D> {
+impl<D: Data> Ground<'_, D> {
     fn stand(&mut self, model: TubeModel) -> Stand {
         self.passes += 1;
         let pass = self.data.pass(&model, self.way.cutoff_mm);
@@ -265,7 +263,9 @@ impl<D: Data> Course<'_, D> {
     }
 
     fn equations(&self, at: &Stand) -> (DMatrix<f64>, DVector<f64>) {
-        bounded_equations(&at.model, &at.pass.moments, self.parameters, &self.prior, self.way.noise_mm)
+        let (model, noise_mm) = (&at.model, self.way.noise_mm);
+        let all = expectant_equations(model, &at.pass.moments, self.parameters, &self.prior, noise_mm);
+        held_at_bounds(model, self.parameters, all)
     }
 
     /// The first step of rising damping that leads down.
@@ -314,11 +314,11 @@ pub fn descend(
     prior: Option<RadiusPrior>,
     way: Way,
 ) -> Descent {
-    let mut course = Course { data, parameters, prior, way, passes: 0 };
-    let mut at = course.stand(start);
+    let mut ground = Ground { data, parameters, prior, way, passes: 0 };
+    let mut at = ground.stand(start);
     let (mut damping, mut leaps, mut stop) = (NO_DAMPING, 0, Stop::Iterations);
     for taken in 0..way.steps {
-        let equations = course.equations(&at);
+        let equations = ground.equations(&at);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
         // since in a narrow valley damped steps are short.
         let left = damped_step(&equations.0, &equations.1, NO_DAMPING)
@@ -327,12 +327,12 @@ pub fn descend(
             stop = Stop::Converged;
             break;
         }
-        let next = course.downhill(&at, &equations, &mut damping);
+        let next = ground.downhill(&at, &equations, &mut damping);
         let gain = next.as_ref().map_or(0.0, |next| at.cost - next.cost);
         at = next.unwrap_or(at);
         let promised = if left.is_finite() { left } else { 0.0 };
         if gain <= LEAST_SHARE * promised {
-            let leapt = if leaps < LEAPS { course.leap(&at) } else { None };
+            let leapt = if leaps < LEAPS { ground.leap(&at) } else { None };
             let Some(leapt) = leapt else {
                 stop = Stop::Stalled;
                 break;
@@ -343,20 +343,7 @@ pub fn descend(
             break;
         }
     }
-    Descent { model: at.model, pass: at.pass, passes: course.passes, stop }
-}
-
-/// Normal equations with what is expected, and without what stands at a bound.
-fn bounded_equations(
-    model: &TubeModel,
-    moments: &[Moment],
-    parameters: &[Parameter],
-    prior: &Option<RadiusPrior>,
-    noise_mm: f64,
-) -> (DMatrix<f64>, DVector<f64>) {
-    let (mut normal, mut gradient) = expectant_equations(model, moments, parameters, prior, noise_mm);
-    hold_at_bounds(model, parameters, &mut normal, &mut gradient);
-    (normal, gradient)
+    Descent { model: at.model, pass: at.pass, passes: ground.passes, stop }
 }
 
 /// Normal equations with what is expected.
@@ -405,18 +392,17 @@ fn is_at_bound(model: &TubeModel, parameter: Parameter) -> bool {
     }
 }
 
-/// Takes those values out of the equations that stand at a bound and would cross it in the step that the others take with
-/// them (each by itself may pull the other way).
-fn hold_at_bounds(
+/// The equations without those values that stand at a bound and would cross it in the step that the others take with them
+/// (each by itself may pull the other way).
+fn held_at_bounds(
     model: &TubeModel,
     parameters: &[Parameter],
-    normal: &mut DMatrix<f64>,
-    gradient: &mut DVector<f64>,
-) {
+    (mut normal, mut gradient): (DMatrix<f64>, DVector<f64>),
+) -> (DMatrix<f64>, DVector<f64>) {
     let mut standing: Vec<usize> =
         (0..parameters.len()).filter(|&j| is_at_bound(model, parameters[j])).collect();
     while !standing.is_empty() {
-        let Some(step) = damped_step(normal, gradient, NO_DAMPING) else { break };
+        let Some(step) = damped_step(&normal, &gradient, NO_DAMPING) else { break };
         let (crossing, inside): (Vec<usize>, Vec<usize>) = standing.into_iter().partition(|&j| step[j] < 0.0);
         for &j in &crossing {
             let diagonal = normal[(j, j)].max(1e-300);
@@ -430,6 +416,7 @@ fn hold_at_bounds(
         }
         standing = inside;
     }
+    (normal, gradient)
 }
 
 /// Marquardt's step: damping in proportion to each parameter's own curvature.

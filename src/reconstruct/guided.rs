@@ -17,6 +17,7 @@ use super::model::{Parameter, TubeModel};
 use super::moves::{with_common_radius, without_bend};
 use super::places::{Course, SHALLOW_RAD, lay};
 use super::profile::lengths;
+use super::search::{DOUBT, JOINT_GAIN};
 use super::sections::CentreLine;
 use super::structure::{self, Shown, Structure};
 use crate::tube::{Lra, Nominal};
@@ -36,17 +37,11 @@ const RADIUS_SPREAD: f64 = 0.3;
 const OFF_RADII: f64 = 0.25;
 const MOST_OFF: usize = 3;
 
-/// Gain of a joint, per independent point, that raises doubt: the free search would try a bend there.
-const JOINT_GAIN: f64 = 30.0;
-
 /// Sections that scatter this much more than their points say are not the tube's.
 const MOST_CORRELATION: f64 = 25.0;
 
 /// Answers that differ by fewer of these are the same.
 const SIGMAS: f64 = 4.0;
-
-/// A bend whose angle is this many times less certain than its values cost is tried without, as the free search does.
-const DOUBT: f64 = 4.0;
 
 /// An angle less certain than this is not measured by the nominal's structure; the free search is asked.
 const MAX_ANGLE_SIGMA_RAD: f64 = 5.0 * DEGREE;

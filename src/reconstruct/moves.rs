@@ -1,4 +1,5 @@
-//! Changes of a tube's structure by one bend: one dropped, two merged into one, one split in two, one put in.
+//! Changes of a tube's structure by one bend: one dropped, two merged into one, one split or doubled, one put in, two drawn
+//! apart; and what goes with them: one CLR for all, end straights that reach as far as their points.
 //!
 //! Under `structure`, which fits every changed tube and keeps what the data supports.
 

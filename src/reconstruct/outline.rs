@@ -7,7 +7,7 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::edge::Edge;
-use super::radius::median;
+use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::square::{self, Estimate, Weighed};
 
 /// Sectors around the tube: not narrower than this many steps of the pattern.
@@ -252,7 +252,7 @@ impl Rough {
         for _ in 0..12 {
             let off: Vec<f64> = sectors.iter().map(|s| s.begin_mm - s.row.dot(&value)).collect();
             let mut sizes: Vec<f64> = off.iter().map(|r| r.abs()).collect();
-            let scale = (1.4826 * median(&mut sizes)?).max(CHANCE_STEPS * rim.step_mm);
+            let scale = (MEDIAN_TO_SIGMA * median(&mut sizes)?).max(CHANCE_STEPS * rim.step_mm);
             weights = off.iter().map(|r| biweight(r / (CUTOFF_SECTORS * scale))).collect();
             let prior = (scale / LOOSE_SPREAD).powi(2);
             let mut normal = Matrix3::from_diagonal(&Vector3::new(0.0, prior, prior));

@@ -219,6 +219,9 @@ fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
     Some(Candidate { radius_mm: radius_mm?, support, rms_mm: rms[rms.len() / 4] })
 }
 
+/// Median of |x| to standard deviation for normal errors.
+pub const MEDIAN_TO_SIGMA: f64 = 1.4826;
+
 /// Median; None without values.
 pub fn median(values: &mut [f64]) -> Option<f64> {
     if values.is_empty() {

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::evidence::{Joint, Solved};
-use super::fit::{Descent, RadiusPrior, Way, descend};
+use super::fit::{RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
 use super::moves::{doubled, drawn_apart, likeliest_pairs, merged, split, with_bend, without_bend};
 use super::sections::CentreLine;
@@ -26,7 +26,7 @@ pub(super) const DOUBT: f64 = 4.0;
 const REMEMBERED: usize = 5;
 
 /// Gain of a joint, per independent point, that makes a bend be tried there.
-const JOINT_GAIN: f64 = 30.0;
+pub(super) const JOINT_GAIN: f64 = 30.0;
 
 /// Joints tried per round, and rounds.
 const JOINTS: usize = 3;
@@ -100,19 +100,14 @@ impl Jury {
             / 2.0;
         let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth };
         let descent = descend(&mut self.line.clone(), model, &parameters, self.prior, way);
-        self.scored(descent, parameters)
+        let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / self.correlation;
+        let score = misfit + self.price(parameters.len(), descent.model.lra.bends.len());
+        Candidate { model: descent.model, parameters, score }
     }
 
     /// Scores a model as it is.
     pub(super) fn judge(&self, model: TubeModel) -> Candidate {
         self.fit(&model, 0, f64::INFINITY)
-    }
-
-    pub(super) fn scored(&self, descent: Descent, parameters: Vec<Parameter>) -> Candidate {
-        let noise_mm = self.line.noise_mm;
-        let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / self.correlation;
-        let score = misfit + self.price(parameters.len(), descent.model.lra.bends.len());
-        Candidate { model: descent.model, parameters, score }
     }
 
     /// What a number of values costs; and each bend, that its place is the best of so many (extended information

@@ -148,18 +148,17 @@ impl Bins {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
 
     /// A long series of shifts, each following the one before by `follows` (0 to 1).
     fn series(follows: f64) -> Vec<Vector3<f64>> {
-        let mut state = 11_u64;
-        let mut next = move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-        };
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
         let fresh = (1.0 - follows * follows).sqrt();
         let mut at = 0.0;
         let mut step = || {
-            at = follows * at + fresh * (0..12).map(|_| next()).sum::<f64>();
+            at = follows * at + fresh * rng.sample::<f64, _>(StandardNormal);
             Vector3::new(0.0, at, 0.0)
         };
         (0..20_000).map(|_| step()).collect()

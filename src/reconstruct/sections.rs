@@ -13,7 +13,7 @@ use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
-use super::radius::median;
+use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::section::{
     Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
     solve,
@@ -36,8 +36,6 @@ const MOST_OUTSIDE: f64 = 0.25;
 const MOST_STRANGERS: f64 = 0.5;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
-/// Median of |x| to standard deviation for normal errors.
-const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
 /// Neighbouring sections are taken to follow each other no more than this.
 const MOST_FOLLOWING: f64 = 0.9;

@@ -5,9 +5,10 @@
 //! Under `structure`: what moves the tube by no more than that is no bend. Of a file in another order neighbours come from
 //! all passes, and nothing is found. (The tube's ends ask `passes` instead, which needs no order, but straights.)
 
+use super::fit::CUTOFF_SIGMAS;
 use super::local::prepare;
 use super::model::TubeModel;
-use super::radius::median;
+use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::whole::Whole;
 
 /// Neighbours in the file are no farther apart than this, in tube radii.
@@ -19,10 +20,6 @@ const RUN: usize = 1000;
 const LEAST_PAIRS: usize = 500;
 /// A share of the variance that is within the error of both estimates.
 const LEAST_SHARE: f64 = 0.1;
-/// Residuals beyond so many standard deviations are no tube's.
-const CUTOFF_SIGMAS: f64 = 6.0;
-/// Median of |x| to standard deviation for normal errors.
-const MEDIAN_TO_SIGMA: f64 = 1.4826;
 
 /// Neighbours so far.
 #[derive(Default)]
@@ -66,6 +63,9 @@ mod tests {
     use crate::cloud::PointCloud;
     use crate::tube::{Frame, Lra};
     use nalgebra::Point3;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
 
     const RADIUS: f64 = 10.0;
     const NOISE: f64 = 0.03;
@@ -76,17 +76,12 @@ mod tests {
 
     /// Two passes, each in stripes over half of the tube, one off by as much out as the other in.
     fn passes(apart_mm: f64) -> Vec<Point3<f64>> {
-        let mut state = 7_u64;
-        let mut next = move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-        };
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
         let mut points = Vec::new();
         for pass in [-1.0, 1.0] {
             for stripe in 0..100 {
                 for k in 0..60 {
-                    // Near enough to normal: the sum of twelve uniform numbers.
-                    let off = NOISE * (0..12).map(|_| next()).sum::<f64>() + pass * apart_mm;
+                    let off = NOISE * rng.sample::<f64, _>(StandardNormal) + pass * apart_mm;
                     let turn = 0.05 * f64::from(k);
                     let r = RADIUS + off;
                     points.push(Point3::new(f64::from(stripe), r * turn.cos(), r * turn.sin()));
