@@ -47,6 +47,9 @@ const LEAST_LENGTH_RADII: f64 = 3.0;
 const LEAST_ON_SURFACE: f64 = 0.5;
 const SURFACE_SHARE: f64 = 0.15;
 
+/// Of two radii for one tube that one stays which has more points within so many times the noise of cylinders.
+const EXACT: f64 = 3.0;
+
 /// Candidates of the radius that are followed up, with this share of the best one's support.
 const CANDIDATES: usize = 3;
 const LEAST_OF_BEST: f64 = 0.25;
@@ -86,6 +89,7 @@ pub fn look(cloud: &PointCloud, nominal: Option<&Nominal>) -> Result<Scene, Reco
         || ReconstructError::NoTube { points: cloud.len(), faces: faces.len(), spacing_mm: rest.spacing_mm };
     let candidates = radius::candidates(&rest.cloud, rest.spacing_mm);
     let best = candidates.first().ok_or_else(no_tube)?.support;
+    let exact_mm = EXACT * candidates.iter().map(|c| c.rms_mm).fold(f64::INFINITY, f64::min);
     let mut tubes: Vec<Tube> = Vec::new();
     let mut sparse = None;
     for candidate in candidates.iter().take(CANDIDATES).filter(|c| c.support >= LEAST_OF_BEST * best) {
@@ -99,7 +103,7 @@ pub fn look(cloud: &PointCloud, nominal: Option<&Nominal>) -> Result<Scene, Reco
             let points = work.len();
             sparse = Some(ReconstructError::TooSparse { found, points, radius_mm, wanted_mm });
         }
-        found.into_iter().for_each(|t| keep_apart(&mut tubes, t));
+        found.into_iter().for_each(|t| keep_apart(&mut tubes, t, &rest.cloud, exact_mm));
     }
     if tubes.is_empty() {
         return Err(sparse.unwrap_or_else(no_tube));
@@ -178,15 +182,27 @@ fn on_surface(around: &Surroundings, radius_mm: f64, work: &PointCloud) -> Optio
     (on as f64 >= LEAST_ON_SURFACE * near as f64).then_some(on)
 }
 
-/// Adds a tube unless it is one that was found with another radius.
-fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube) {
-    let known = tubes.iter().any(|t| {
+/// Adds a tube. Where it is one that was found with another radius, the better one stays: a narrow view of a tube also
+/// looks like one of another radius, but with fewer points exactly on its surface.
+fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube, cloud: &PointCloud, exact_mm: f64) {
+    let same = |t: &Tube| {
         let inside = tube.polygon.iter().filter(|p| t.around.is_near(p)).count();
         2 * inside > tube.polygon.len()
-    });
-    if !known {
-        tubes.push(tube);
+    };
+    match tubes.iter_mut().find(|t| same(t)) {
+        None => tubes.push(tube),
+        Some(known) if exactly_on(&tube, cloud, exact_mm) > exactly_on(known, cloud, exact_mm) => *known = tube,
+        Some(_) => (),
     }
+}
+
+/// Number of the cloud's points that lie on a tube's surface to about their noise.
+fn exactly_on(tube: &Tube, cloud: &PointCloud, exact_mm: f64) -> usize {
+    let on = |i: &usize| {
+        let distance = tube.around.distance_mm(&cloud.point(*i));
+        distance.is_some_and(|d| (d - tube.radius_mm).abs() < exact_mm)
+    };
+    (0..cloud.len()).into_par_iter().with_min_len(512).filter(on).count()
 }
 
 /// The tube that is wanted, and a warning when there are others.
