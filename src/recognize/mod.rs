@@ -4,6 +4,8 @@
 
 mod jet;
 mod planes;
+mod robust;
 
 pub use jet::{Jet, MIN_NEIGHBOURS, fit_jet};
 pub use planes::{Face, find_planes};
+pub use robust::{MEDIAN_TO_SIGMA, median};

@@ -8,6 +8,8 @@
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 use rayon::prelude::*;
 
+use super::robust::{MEDIAN_TO_SIGMA, median};
+
 /// A planar face.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Face {
@@ -44,6 +46,10 @@ const MIN_POINTS: usize = 8;
 
 /// A patch belongs to a cluster up to this many times the noise.
 const CLUSTER_SIGMAS: f64 = 2.5;
+
+/// Points of a patch farther from its plane are left out of it, so many times at most.
+const TRIM_SIGMAS: f64 = 3.0;
+const TRIMS: usize = 6;
 
 /// Share of all points, those of the flattest patches, that tells the noise.
 const FLAT_SHARE: f64 = 0.2;
@@ -172,9 +178,7 @@ fn cut(points: &[Vector3<f64>], cell_mm: f64) -> Vec<Patch> {
     order.sort_unstable();
     let patch = |run: &&[u128]| {
         let members: Vec<u32> = run.iter().map(|&number| number as u32).collect();
-        let mut moments = Moments::default();
-        members.iter().for_each(|&i| moments.add(&points[i as usize]));
-        let plane = moments.plane();
+        let (moments, plane) = robust(&members, points);
         // A sliver at a voxel's corner is flat whatever it belongs to.
         let tells = members.len() >= MIN_POINTS && plane.width_mm > 0.12 * cell_mm;
         let rms_mm = if tells { plane.rms_mm } else { f64::INFINITY };
@@ -188,6 +192,28 @@ fn cut(points: &[Vector3<f64>], cell_mm: f64) -> Vec<Patch> {
     };
     let runs: Vec<&[u128]> = order.chunk_by(|a, b| a >> 32 == b >> 32).collect();
     runs.par_iter().map(patch).collect()
+}
+
+/// Moments and plane of a patch's points without those that stand off it: flying points fill many cells of a thinned
+/// cloud, and a few make a table look as rough as a tube is round.
+fn robust(members: &[u32], points: &[Vector3<f64>]) -> (Moments, Plane) {
+    let mut moments = Moments::default();
+    members.iter().for_each(|&i| moments.add(&points[i as usize]));
+    let mut plane = moments.plane();
+    let off = |plane: &Plane, i: u32| (points[i as usize].dot(&plane.normal) - plane.offset_mm).abs();
+    for _ in 0..TRIMS {
+        let mut distances: Vec<f64> = members.iter().map(|&i| off(&plane, i)).collect();
+        let sigma_mm = MEDIAN_TO_SIGMA * median(&mut distances).unwrap_or(0.0);
+        let kept = |i: &&u32| off(&plane, **i) <= TRIM_SIGMAS * sigma_mm;
+        let mut trimmed = Moments::default();
+        members.iter().filter(kept).for_each(|&i| trimmed.add(&points[i as usize]));
+        if trimmed.count == moments.count {
+            break;
+        }
+        moments = trimmed;
+        plane = moments.plane();
+    }
+    (moments, plane)
 }
 
 /// Noise of the flattest patches.

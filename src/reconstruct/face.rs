@@ -5,7 +5,7 @@
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use super::radius::{MEDIAN_TO_SIGMA, median};
+use crate::recognize::{MEDIAN_TO_SIGMA, median};
 
 /// Trial planes, and most points that vote on them.
 const TRIALS: usize = 400;

@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector};
 use super::model::{Parameter, TubeModel};
 use super::moments::{Moment, Pass, Sample};
 use super::normal::equations;
-use super::radius::MEDIAN_TO_SIGMA;
+use crate::recognize::MEDIAN_TO_SIGMA;
 
 /// Cut-off of the biweight in standard deviations: at 6 it keeps 98 % of the efficiency of plain least squares.
 pub const CUTOFF_SIGMAS: f64 = 6.0;

@@ -6,8 +6,8 @@
 use nalgebra::Point3;
 
 use super::mls::SpinePoint;
-use super::radius::median;
 use crate::cloud::{Neighbours, PointCloud};
+use crate::recognize::median;
 
 /// Points farther apart than this many tube radii do not tell whether one follows the other.
 const REACH_RADII: f64 = 1.2;

@@ -6,9 +6,9 @@ use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
 use super::follow::followed;
-use super::radius::{JET_RADII, Near, median};
+use super::radius::{JET_RADII, Near};
 use crate::cloud::{Grid, Neighbours, PointCloud};
-use crate::recognize::{Jet, fit_jet};
+use crate::recognize::{Jet, fit_jet, median};
 
 /// Distance of the spine's points, in tube radii.
 pub const SPINE_SPACING_RADII: f64 = 0.3;

@@ -6,8 +6,8 @@
 use nalgebra::Point3;
 use rayon::prelude::*;
 
-use super::radius::median;
 use crate::cloud::{Grid, PointCloud};
+use crate::recognize::median;
 
 /// A thinned cloud and the usual distance of its points.
 #[derive(Debug, Clone)]

@@ -7,8 +7,8 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::edge::Edge;
-use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::square::{self, Estimate, Weighed};
+use crate::recognize::{MEDIAN_TO_SIGMA, median};
 
 /// Sectors around the tube: not narrower than this many steps of the pattern.
 const SECTOR_STEPS: f64 = 1.5;

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::cylinder::{Cylinder, REACH_RADII, fit_cylinder};
 use crate::cloud::{Grid, PointCloud};
-use crate::recognize::{Jet, fit_jet};
+use crate::recognize::{Jet, fit_jet, median};
 
 /// Neighbourhood of a jet in tube radii (paper 000, section 7).
 pub const JET_RADII: f64 = 2.0 / 3.0;
@@ -217,17 +217,4 @@ fn judge(cloud: &PointCloud, radius_mm: f64) -> Option<Candidate> {
     let mut rms: Vec<f64> = fitted.iter().filter(within).map(|f| f.2).collect();
     rms.sort_by(f64::total_cmp);
     Some(Candidate { radius_mm: radius_mm?, support, rms_mm: rms[rms.len() / 4] })
-}
-
-/// Median of |x| to standard deviation for normal errors.
-pub const MEDIAN_TO_SIGMA: f64 = 1.4826;
-
-/// Median; None without values.
-pub fn median(values: &mut [f64]) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    let (_, m, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
-    Some(*m)
 }

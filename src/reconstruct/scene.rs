@@ -191,7 +191,9 @@ fn keep_apart(tubes: &mut Vec<Tube>, tube: Tube, cloud: &PointCloud, exact_mm: f
     };
     match tubes.iter_mut().find(|t| same(t)) {
         None => tubes.push(tube),
-        Some(known) if exactly_on(&tube, cloud, exact_mm) > exactly_on(known, cloud, exact_mm) => *known = tube,
+        Some(known) if exactly_on(&tube, cloud, exact_mm) > exactly_on(known, cloud, exact_mm) => {
+            *known = tube
+        }
         Some(_) => (),
     }
 }

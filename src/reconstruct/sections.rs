@@ -13,11 +13,11 @@ use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
-use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::section::{
     Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
     solve,
 };
+use crate::recognize::{MEDIAN_TO_SIGMA, median};
 use crate::tube::any_normal;
 
 /// The same about a base that has been fitted, radius and ovality and all.

@@ -9,12 +9,12 @@ use nalgebra::Vector3;
 use super::fit::Fit;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
-use super::radius::median;
 use super::section::{
     Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, Values, cost, doubt_ovality, oval_doubt_mm, persistence,
     solve,
 };
 use super::whole::Whole;
+use crate::recognize::median;
 use crate::tube::Spine;
 
 /// Weighted products of a stretch's derivatives (five values) and the residual: the lower triangle, row by row.

@@ -8,8 +8,8 @@
 use super::fit::CUTOFF_SIGMAS;
 use super::local::prepare;
 use super::model::TubeModel;
-use super::radius::{MEDIAN_TO_SIGMA, median};
 use super::whole::Whole;
+use crate::recognize::{MEDIAN_TO_SIGMA, median};
 
 /// Neighbours in the file are no farther apart than this, in tube radii.
 const NEIGHBOUR_RADII: f64 = 0.35;
