@@ -37,6 +37,7 @@ mod passes;
 mod places;
 mod profile;
 pub mod radius;
+mod reach;
 pub mod scene;
 mod search;
 #[cfg(test)]

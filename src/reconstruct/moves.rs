@@ -1,13 +1,13 @@
 //! Changes of a tube's structure by one bend: one dropped, two merged into one, one split or doubled, one put in, two drawn
-//! apart; and what goes with them: one CLR for all, end straights that reach as far as their points.
+//! apart; and what goes with them: one CLR for all.
 //!
 //! Under `structure`, which fits every changed tube and keeps what the data supports.
 
-use nalgebra::{Point3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
 use super::evidence::Joint;
 use super::model::TubeModel;
-use crate::tube::{Bend, Frame, Lra, Segment};
+use crate::tube::{Bend, Lra, Segment};
 
 /// Seamless joints in one plane from which on a table is no bent tube's.
 const FREE_FORM_JOINTS: usize = 4;
@@ -35,57 +35,6 @@ pub fn mean_radius_mm(model: &TubeModel) -> Option<f64> {
     let weight: f64 = model.lra.bends.iter().map(|b| b.angle_rad).sum();
     let sum: f64 = model.lra.bends.iter().map(|b| b.angle_rad * b.radius_mm).sum();
     (weight > 0.0).then(|| sum / weight)
-}
-
-/// Points this near to an end straight's surface are its own. It goes on while stretches of this length, in tube radii, hold
-/// such a share of the points that its last one does; stretches that hold less than such a share of what the tube's usually
-/// do are not its own.
-const OWN_SHARE: f64 = 0.1;
-const STRETCH_RADII: f64 = 0.5;
-const LEAST_DENSITY: f64 = 0.3;
-const EMPTY_DENSITY: f64 = 0.1;
-
-/// The tube with end straights that reach as far as its points do: no fit moves their ends, and bends come and go beside
-/// them.
-pub fn reaching(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
-    let spine = model.spine();
-    let mut out = model.clone();
-    out.lra.last_length_mm +=
-        beyond_mm(model, points, &spine.frame_at(spine.length_mm()), model.lra.last_length_mm);
-    if let Some(first) = out.lra.bends.first_mut() {
-        let outward = model.start * Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
-        let before_mm = beyond_mm(model, points, &outward, first.length_mm);
-        first.length_mm += before_mm;
-        out.start *= Frame::translation(-before_mm, 0.0, 0.0);
-    }
-    out
-}
-
-/// How far points go on beyond an end straight, along +x of the frame at its end; less than zero, and no less than its
-/// length, when they stop before.
-fn beyond_mm(model: &TubeModel, points: &[Point3<f64>], end: &Frame, length_mm: f64) -> f64 {
-    let radius = model.tube_radius_mm;
-    let stretch_mm = STRETCH_RADII * radius;
-    let inside = ((length_mm / stretch_mm).ceil() as usize).max(1);
-    let mut counts = vec![0usize; inside];
-    let inverse = end.inverse();
-    for p in points.iter().map(|p| inverse * p) {
-        let stretch = (p.x / stretch_mm).floor() + inside as f64;
-        if stretch >= 0.0 && (p.y.hypot(p.z) - radius).abs() < OWN_SHARE * radius {
-            let stretch = stretch as usize;
-            counts.resize(counts.len().max(stretch + 1), 0);
-            counts[stretch] += 1;
-        }
-    }
-    let usual = points.len() as f64 * stretch_mm / model.spine().length_mm().max(stretch_mm);
-    let own = counts[..inside].iter().rposition(|c| *c as f64 > EMPTY_DENSITY * usual);
-    if own != Some(inside - 1) {
-        let empty = inside - own.map_or(0, |i| i + 1);
-        return -(empty as f64 * stretch_mm).min(length_mm);
-    }
-    let last = counts[inside - 1] as f64;
-    let more = counts[inside..].iter().take_while(|c| **c as f64 > LEAST_DENSITY * last).count();
-    more as f64 * stretch_mm
 }
 
 /// The tube with one CLR for all bends.

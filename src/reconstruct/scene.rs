@@ -13,6 +13,7 @@ use super::mls::{self, SPINE_SPACING_RADII, SpinePoint, WORK_CELL_RADII};
 use super::moderate::{Moderate, any_share, moderate};
 use super::owner::Surroundings;
 use super::radius::{self, Candidate};
+use super::reach;
 use crate::cloud::PointCloud;
 use crate::recognize::{Face, find_planes};
 use crate::tube::Nominal;
@@ -240,7 +241,9 @@ fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<
 
 /// Tells the tube's points from the others.
 fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, warnings: Vec<String>) -> Scene {
-    let Tube { radius_mm, polygon, around, .. } = tube;
+    let Tube { radius_mm, polygon, .. } = tube;
+    let polygon = reach::drawn_on(polygon, SPINE_SPACING_RADII * radius_mm, radius_mm, &rest.cloud);
+    let around = Surroundings::new(&polygon, radius_mm);
     let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
     // Thinning makes strays many: their share is that among any points.
     let some = any_share(cloud, SOME_POINTS);

@@ -6,8 +6,9 @@ use proptest::prelude::*;
 use super::evidence::Solved;
 use super::fit::{Data, RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
-use super::moves::{doubled, drawn_apart, merged, reaching, with_wide_doubled, without_bend};
+use super::moves::{doubled, drawn_apart, merged, with_wide_doubled, without_bend};
 use super::normal;
+use super::reach::reaching;
 use super::sections::CentreLine;
 use crate::tube::{Bend, Frame, Lra};
 

@@ -10,10 +10,9 @@ use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
-use super::moves::{
-    is_free_form, mean_radius_mm, reaching, with_common_radius, with_wide_doubled, without_bend,
-};
+use super::moves::{is_free_form, mean_radius_mm, with_common_radius, with_wide_doubled, without_bend};
 use super::profile::{Held, lengths};
+use super::reach::reaching;
 use super::scene::Scene;
 use super::search::{Candidate, DOUBT, FULL_STEPS, Jury};
 use super::sections::CentreLine;

@@ -1,0 +1,128 @@
+//! How far a tube's ends reach: as far as points lie on the surface of the straight there. The centre line of the scene is
+//! drawn on so far, that the points there are taken for the tube's; and a tube that is being searched is lengthened and
+//! shortened so, since no fit moves its ends.
+//!
+//! Used by `scene` and `structure`; exact ends are found later, by [`ends`](super::ends).
+
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+
+use super::model::TubeModel;
+use crate::cloud::PointCloud;
+use crate::tube::Frame;
+
+/// Points this near to the surface of an end straight are its own. It goes on while stretches of this length, in tube radii,
+/// hold such a share of the points that the one before them does; one that holds less than such a share of what is usual
+/// is not its own.
+const OWN_SHARE: f64 = 0.1;
+const STRETCH_RADII: f64 = 0.5;
+const LEAST_DENSITY: f64 = 0.3;
+const EMPTY_DENSITY: f64 = 0.1;
+
+/// The end of a centre line in tube radii that tells its direction, how straight it must be, and how far it is drawn on.
+const END_RADII: f64 = 3.0;
+const STRAIGHT_SHARE: f64 = 0.03;
+const MOST_RADII: f64 = 12.0;
+
+/// A centre line with vertices about `spacing_mm` apart, drawn on past its ends as far as the points go on. They are to be
+/// without planar faces: a table that the tube lies on goes on as well.
+pub fn drawn_on(
+    mut polygon: Vec<Point3<f64>>,
+    spacing_mm: f64,
+    radius_mm: f64,
+    points: &PointCloud,
+) -> Vec<Point3<f64>> {
+    for _ in 0..2 {
+        polygon.reverse();
+        if let Some(end) = straight_end(&polygon, radius_mm) {
+            let counts = Counts::new(points.iter(), &end, radius_mm, END_RADII * radius_mm);
+            let more_mm = counts.beyond_mm().min(MOST_RADII * radius_mm);
+            let vertices = (more_mm / spacing_mm) as usize;
+            polygon.extend((1..=vertices).map(|k| end * Point3::new(k as f64 * spacing_mm, 0.0, 0.0)));
+        }
+    }
+    polygon
+}
+
+/// The frame at a polygon's last vertex, its x axis outwards along the last few; None when they are not in line.
+fn straight_end(polygon: &[Point3<f64>], radius_mm: f64) -> Option<Frame> {
+    let last = polygon.last()?;
+    let near = |p: &&Point3<f64>| (*p - last).norm() <= END_RADII * radius_mm;
+    let end: Vec<Point3<f64>> = polygon.iter().rev().take_while(near).copied().collect();
+    let n = end.len();
+    if n < 4 {
+        return None;
+    }
+    let middle =
+        |part: &[Point3<f64>]| part.iter().map(|p| p.coords).sum::<Vector3<f64>>() / part.len() as f64;
+    let (outer, inner) = (middle(&end[..n / 2]), middle(&end[n / 2..]));
+    let along = (outer - inner).try_normalize(1e-12)?;
+    let off = |p: &Point3<f64>| (p.coords - outer).cross(&along).norm();
+    if end.iter().any(|p| off(p) > STRAIGHT_SHARE * radius_mm) {
+        return None;
+    }
+    let turn = UnitQuaternion::rotation_between(&Vector3::x(), &along)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::y_axis(), std::f64::consts::PI));
+    let foot = outer + along * (last.coords - outer).dot(&along);
+    Some(Frame::from_parts(foot.into(), turn))
+}
+
+/// The tube with end straights that reach as far as its points do, and no farther.
+pub fn reaching(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
+    let spine = model.spine();
+    let radius = model.tube_radius_mm;
+    let usual = points.len() as f64 * STRETCH_RADII * radius / spine.length_mm().max(radius);
+    let change_mm = |end: &Frame, length_mm: f64| {
+        let counts = Counts::new(points.iter().copied(), end, radius, length_mm);
+        let short_mm = counts.empty_mm(usual).min(length_mm);
+        if short_mm > 0.0 { -short_mm } else { counts.beyond_mm() }
+    };
+    let mut out = model.clone();
+    out.lra.last_length_mm += change_mm(&spine.frame_at(spine.length_mm()), model.lra.last_length_mm);
+    if let Some(first) = out.lra.bends.first_mut() {
+        let outward = model.start * Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
+        let before_mm = change_mm(&outward, first.length_mm);
+        first.length_mm += before_mm;
+        out.start *= Frame::translation(-before_mm, 0.0, 0.0);
+    }
+    out
+}
+
+/// How many points the stretches about an end hold, outwards.
+struct Counts {
+    stretch_mm: f64,
+    inside: usize,
+    counts: Vec<usize>,
+}
+
+impl Counts {
+    /// About the origin of a frame whose x axis points outwards, from `length_mm` before it.
+    fn new(points: impl Iterator<Item = Point3<f64>>, end: &Frame, radius_mm: f64, length_mm: f64) -> Counts {
+        let stretch_mm = STRETCH_RADII * radius_mm;
+        let inside = ((length_mm / stretch_mm).ceil() as usize).max(1);
+        let mut counts = vec![0; inside];
+        let inverse = end.inverse();
+        for p in points.map(|p| inverse * p) {
+            let stretch = (p.x / stretch_mm).floor() + inside as f64;
+            if stretch >= 0.0 && (p.y.hypot(p.z) - radius_mm).abs() < OWN_SHARE * radius_mm {
+                let stretch = stretch as usize;
+                counts.resize(counts.len().max(stretch + 1), 0);
+                counts[stretch] += 1;
+            }
+        }
+        Counts { stretch_mm, inside, counts }
+    }
+
+    /// How far the points go on beyond the end.
+    fn beyond_mm(&self) -> f64 {
+        let last = self.counts[self.inside - 1] as f64;
+        let goes_on = |c: &&usize| **c as f64 > LEAST_DENSITY * last;
+        self.counts[self.inside..].iter().take_while(goes_on).count() as f64 * self.stretch_mm
+    }
+
+    /// How far the end is beyond the last stretch that is not empty.
+    fn empty_mm(&self, usual: f64) -> f64 {
+        let holds = |c: &usize| *c as f64 > EMPTY_DENSITY * usual;
+        let last = self.counts[..self.inside].iter().rposition(holds);
+        (self.inside - last.map_or(0, |i| i + 1)) as f64 * self.stretch_mm
+    }
+}
