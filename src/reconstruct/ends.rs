@@ -22,6 +22,10 @@ const LEAST_AGREEING: f64 = 0.6;
 const OUTSIDE_SIGMAS: std::ops::Range<f64> = -1.0..3.5;
 /// An outline is no sharper than this share of the noise: the rim of a face that does not show by itself blurs it.
 const RIM_SIGMAS: f64 = 0.3;
+/// So many points, and such a share of those before it, within a tube radius from so far beyond the outline are the tube's.
+const FEWEST_BEYOND: usize = 8;
+const SHARE_BEYOND: f64 = 0.04;
+const BEYOND_RADII: f64 = 0.15;
 /// What differs by more than this many standard deviations is not the same.
 const DIFFERENT_SIGMAS: f64 = 4.0;
 
@@ -96,7 +100,23 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, passes_mm: f6
             return Some(End::Found(Place { at_mm: face.at_mm, sigma_mm, cut_rad, by_outline: false }));
         }
     }
+    if goes_on(&surface, &outline, radius_mm, near_mm) {
+        return Some(End::Ragged { at_mm: outline.at_mm });
+    }
     Some(by_outline(&outline, noise_mm))
+}
+
+/// Whether the outside goes on past the outline somewhere: then it is that of a jaw that hides the rest, or of a patch
+/// that was not scanned.
+fn goes_on(surface: &[Point3<f64>], outline: &Outline, radius_mm: f64, near_mm: f64) -> bool {
+    let beyond_mm = near_mm.max(BEYOND_RADII * radius_mm);
+    let (mut before, mut beyond) = (0, 0);
+    for p in surface {
+        let x = p.x - outline.at_mm - outline.slope[0] * p.y - outline.slope[1] * p.z;
+        before += usize::from((0.0..radius_mm).contains(&x));
+        beyond += usize::from((-radius_mm..0.0).contains(&(x + beyond_mm)));
+    }
+    beyond >= FEWEST_BEYOND && beyond as f64 > SHARE_BEYOND * before as f64
 }
 
 fn by_outline(outline: &Outline, noise_mm: f64) -> End {

@@ -23,6 +23,9 @@ const END_RADII: f64 = 3.0;
 const STRAIGHT_SHARE: f64 = 0.03;
 const MOST_RADII: f64 = 12.0;
 
+/// It stops so far before the end: what lies so near is taken anyway, and burr and bore begin there.
+const WITHIN_RADII: f64 = 0.5;
+
 /// A centre line with vertices about `spacing_mm` apart, drawn on past its ends as far as the points go on. They are to be
 /// without planar faces: a table that the tube lies on goes on as well.
 pub fn drawn_on(
@@ -35,8 +38,8 @@ pub fn drawn_on(
         polygon.reverse();
         if let Some(end) = straight_end(&polygon, radius_mm) {
             let counts = Counts::new(points.iter(), &end, radius_mm, END_RADII * radius_mm);
-            let more_mm = counts.beyond_mm().min(MOST_RADII * radius_mm);
-            let vertices = (more_mm / spacing_mm) as usize;
+            let more_mm = counts.beyond_mm().min(MOST_RADII * radius_mm) - WITHIN_RADII * radius_mm;
+            let vertices = (more_mm / spacing_mm).max(0.0) as usize;
             polygon.extend((1..=vertices).map(|k| end * Point3::new(k as f64 * spacing_mm, 0.0, 0.0)));
         }
     }
