@@ -9,8 +9,8 @@ pub const SAW_SPREAD: f64 = 0.0017;
 const MITRE_SPREAD: f64 = 0.07;
 /// Share of the ends that are cut square: a saw that is set for a mitre is the rarer one.
 const SQUARE_SHARE: f64 = 0.85;
-/// Share of a normal distribution within two standard deviations.
-const TWO_SIGMAS: f64 = 0.9545;
+/// So many standard deviations are to hold such a share of where the plane may be: of a normal distribution they hold that or more.
+const WITHIN: [(f64, f64); 2] = [(2.0, 0.9545), (3.0, 0.9973)];
 
 /// A plane x = at + slope . (y, z) with its covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,8 +26,9 @@ pub struct Estimate {
 pub struct Weighed {
     /// Their mean, each with its share, and the covariance about it.
     pub estimate: Estimate,
-    /// Twice this holds 95.4 % of where the plane may meet the axis. The two together are no normal distribution, and
-    /// its standard deviation would speak for a mitre even where that is all but excluded.
+    /// Twice this holds 95.4 % of where the plane may meet the axis, or more, and three times this 99.7 %. The two together are
+    /// no normal distribution: its standard deviation would speak for a mitre even where that is all but excluded, and
+    /// twice it alone would be silent of one that is not.
     pub sigma_mm: f64,
     /// How likely it is cut square.
     pub square_share: f64,
@@ -48,12 +49,14 @@ pub fn weigh(free: &Estimate, square: &Estimate, scatter: &Matrix3<f64>) -> Weig
             + mitred.variance * (1.0 - share)
             + apart * apart.transpose() * (share * (1.0 - share)),
     };
-    let sigma_mm = 0.5 * reach_mm(&[(share, square), (1.0 - share, &mitred)], estimate.value.x);
+    let parts = [(share, square), (1.0 - share, &mitred)];
+    let at_sigmas = |(sigmas, within)| reach_mm(&parts, estimate.value.x, within) / sigmas;
+    let sigma_mm = WITHIN.map(at_sigmas).into_iter().fold(0.0, f64::max);
     Weighed { estimate, sigma_mm, square_share: share }
 }
 
-/// How far around `about_mm` 95.4 % of several normal distributions lie, each with its share.
-fn reach_mm(parts: &[(f64, &Estimate)], about_mm: f64) -> f64 {
+/// How far around `about_mm` such a share of several normal distributions lies, each with its own share.
+fn reach_mm(parts: &[(f64, &Estimate)], about_mm: f64, share: f64) -> f64 {
     let within = |reach: f64| -> f64 {
         let one = |(share, part): &(f64, &Estimate)| {
             let (off, sigma) = (part.value.x - about_mm, part.variance[(0, 0)].sqrt().max(1e-12));
@@ -62,11 +65,11 @@ fn reach_mm(parts: &[(f64, &Estimate)], about_mm: f64) -> f64 {
         parts.iter().map(one).sum()
     };
     let widest =
-        |(_, part): &(f64, &Estimate)| (part.value.x - about_mm).abs() + 2.0 * part.variance[(0, 0)].sqrt();
+        |(_, part): &(f64, &Estimate)| (part.value.x - about_mm).abs() + 3.0 * part.variance[(0, 0)].sqrt();
     let (mut low, mut high) = (0.0, parts.iter().map(widest).fold(0.0, f64::max));
     for _ in 0..30 {
         let middle = 0.5 * (low + high);
-        *(if within(middle) < TWO_SIGMAS { &mut low } else { &mut high }) = middle;
+        *(if within(middle) < share { &mut low } else { &mut high }) = middle;
     }
     high
 }
@@ -123,7 +126,8 @@ mod tests {
     fn what_looks_square_is_taken_for_square() {
         let both = weighed(plane(5.3, 0.01, [0.3, 0.01]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
         assert!(both.square_share > 0.98 && (both.estimate.value.x - 5.0).abs() < 0.02, "{both:?}");
-        assert!((0.05..0.06).contains(&both.sigma_mm), "{both:?}");
+        // Three sigmas reach into the mitres that are left: 2 % of all.
+        assert!((0.05..0.2).contains(&both.sigma_mm), "{both:?}");
     }
 
     #[test]
