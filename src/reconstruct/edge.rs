@@ -33,36 +33,48 @@ const FEWEST_PER_STEP: f64 = 6.0;
 /// A point of the outside: along the tube (past a slope), y, z.
 pub type Along = [f64; 3];
 
-/// The points of an end, and what is common to all planes pushed against them.
+/// The points of an end.
 pub struct Edge {
     /// In order along the tube.
     points: Vec<Along>,
-    before: f64,
-    soft_mm: f64,
     step_mm: f64,
     radius_mm: f64,
-    /// Of the points: mean of 1, y, z.
+    pattern: Pattern,
+}
+
+/// What is common to all planes pushed against the same points.
+#[derive(Clone, Copy)]
+struct Pattern {
+    before: f64,
+    soft_mm: f64,
+    /// Mean of 1, y, z.
     centre: Vector3<f64>,
+}
+
+impl Pattern {
+    /// None of too few points, which come in order along the tube.
+    fn of<'a>(mut points: impl Iterator<Item = &'a Along>, step_mm: f64) -> Option<Pattern> {
+        let first = points.next()?;
+        let (mut n, mut last, mut sum) = (1.0, first, row(first));
+        for p in points {
+            n += 1.0;
+            last = p;
+            sum += row(p);
+        }
+        let extent_mm = last[0] - first[0];
+        let per_mm = n / extent_mm.max(1e-9);
+        let before = BEFORE.max(BEFORE_SHARE * per_mm * step_mm);
+        let pattern = Pattern { before, soft_mm: SOFT_SHARE * before / per_mm, centre: sum / n };
+        (per_mm * step_mm >= FEWEST_PER_STEP && extent_mm > 8.0 * step_mm).then_some(pattern)
+    }
 }
 
 impl Edge {
     /// None of too few points.
     pub fn new(mut points: Vec<Along>, radius_mm: f64, step_mm: f64) -> Option<Edge> {
-        points.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        let (first, last) = (points.first()?[0], points.last()?[0]);
-        let n = points.len() as f64;
-        let per_mm = n / (last - first).max(1e-9);
-        let before = BEFORE.max(BEFORE_SHARE * per_mm * step_mm);
-        let soft_mm = SOFT_SHARE * before / per_mm;
-        let centre = points.iter().map(row).sum::<Vector3<f64>>() / n;
-        (per_mm * step_mm >= FEWEST_PER_STEP && last - first > 8.0 * step_mm).then_some(Edge {
-            points,
-            before,
-            soft_mm,
-            step_mm,
-            radius_mm,
-            centre,
-        })
+        points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]));
+        let pattern = Pattern::of(points.iter(), step_mm)?;
+        Some(Edge { points, step_mm, radius_mm, pattern })
     }
 
     /// The points up to `to_mm` past another slope besides.
@@ -70,7 +82,7 @@ impl Edge {
         let near = &self.points[..self.points.partition_point(|p| p[0] < to_mm)];
         let turned = |p: &Along| [p[0] - slope.y * p[1] - slope.z * p[2], p[1], p[2]];
         let mut points: Vec<Along> = near.iter().map(turned).collect();
-        points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]));
         Edge { points, ..*self }
     }
 
@@ -92,7 +104,7 @@ impl Edge {
     /// The edge of a square cut.
     pub fn square(&self) -> Option<Estimate> {
         let mut found = self.estimate(false)?;
-        let (y, z, open) = (self.centre.y, self.centre.z, SAW_SPREAD * SAW_SPREAD);
+        let (y, z, open) = (self.pattern.centre.y, self.pattern.centre.z, SAW_SPREAD * SAW_SPREAD);
         found.variance += Matrix3::new(y * y + z * z, -y, -z, -y, 1.0, 0.0, -z, 0.0, 1.0) * open;
         Some(found)
     }
@@ -100,27 +112,34 @@ impl Edge {
     /// The edge without the arc that stands out before a square edge farther than any does at the known cuts: a burr, or
     /// something that touches the tube there. None where none does.
     pub fn without_burr(&self) -> Option<Edge> {
-        let others: Vec<Edge> = (0..ARCS).filter_map(|k| self.without_arc(k)).collect();
+        // Every point knows the arcs that it is not in: ten copies of the others would be the most memory of a run.
+        let outside = outside_arcs(&self.points);
+        let beside = |arc: usize| {
+            let outside = &outside;
+            move |i: &usize| outside[*i] & (1 << arc) != 0
+        };
+        let others = (0..ARCS).filter_map(|arc| {
+            let points = (0..self.points.len()).filter(beside(arc)).map(|i| &self.points[i]);
+            Some((arc, Pattern::of(points, self.step_mm)?))
+        });
+        let others: Vec<(usize, Pattern)> = others.collect();
         let farthest = |from: f64| {
-            let square = |e: &Edge| Some(e.push(from, false, 0.0)?.x);
-            let all = square(self)?;
-            let off = others.iter().enumerate().filter_map(|(k, e)| Some((k, square(e)? - all)));
-            off.max_by(|a, b| a.1.total_cmp(&b.1))
+            let all = self.push(from, false, 0.0)?.x;
+            let square = |(arc, pattern): &(usize, Pattern)| {
+                Some((*arc, self.push_among(beside(*arc), pattern, from, false, 0.0)?.x - all))
+            };
+            others.iter().filter_map(square).max_by(|a, b| a.1.total_cmp(&b.1))
         };
         let (arc, off_mm) = farthest(f64::NEG_INFINITY)?;
         let begin = self.push(f64::NEG_INFINITY, false, 0.0)?.x;
         let usual: Vec<f64> = self.cuts(begin + off_mm)?.filter_map(|cut| Some(farthest(cut)?.1)).collect();
         let most = usual.iter().copied().fold(0.0, f64::max);
         let stands_out = usual.len() > CUTS / 2 && off_mm > BURR_TIMES * most;
-        others.into_iter().nth(arc).filter(|_| stands_out)
-    }
-
-    /// Without the points of one arc around the tube.
-    fn without_arc(&self, k: usize) -> Option<Edge> {
-        let (sin, cos) = (std::f64::consts::TAU * k as f64 / ARCS as f64).sin_cos();
-        let half = (std::f64::consts::TAU / ARCS as f64).cos();
-        let other = |p: &&Along| p[1] * cos + p[2] * sin < half * p[1].hypot(p[2]);
-        Edge::new(self.points.iter().filter(other).copied().collect(), self.radius_mm, self.step_mm)
+        if !stands_out {
+            return None;
+        }
+        let kept = (0..self.points.len()).filter(beside(arc)).map(|i| self.points[i]).collect();
+        Edge::new(kept, self.radius_mm, self.step_mm)
     }
 
     /// The covariance with which a square edge would be found by [`Edge::free`].
@@ -156,17 +175,30 @@ impl Edge {
 
     /// The plane against the points from `from` on, which are taken for all there are.
     fn push(&self, from: f64, free: bool, soft_mm: f64) -> Option<Vector3<f64>> {
+        self.push_among(|_| true, &self.pattern, from, free, soft_mm)
+    }
+
+    /// The same against those points only that are `kept`, by their indices; `pattern` is theirs.
+    fn push_among(
+        &self,
+        kept: impl Fn(&usize) -> bool,
+        pattern: &Pattern,
+        from: f64,
+        free: bool,
+        soft_mm: f64,
+    ) -> Option<Vector3<f64>> {
         let begin = self.points.partition_point(|p| p[0] < from);
-        let start = self.points.get(begin + self.before as usize)?[0];
+        let start = (begin..self.points.len()).filter(&kept).nth(pattern.before as usize)?;
+        let start = self.points[start][0];
         let end = self.points.partition_point(|p| p[0] < start + DEPTH_STEPS * self.step_mm);
-        let near = self.points.get(begin..end)?;
-        let soft = self.soft_mm.max(soft_mm);
+        let near = (begin..end).filter(&kept).map(|i| &self.points[i]);
+        let pattern = Pattern { soft_mm: pattern.soft_mm.max(soft_mm), ..*pattern };
         let mut value = Vector3::new(start, 0.0, 0.0);
         for _ in 0..ROUNDS {
-            let step = self.newton(near, &value, soft, free)?;
+            let step = self.newton(near.clone(), &pattern, &value, free)?;
             let reach = step.x.abs().max(self.radius_mm * step.y.hypot(step.z));
-            value += step * (4.0 * soft / reach).min(1.0);
-            if reach < 0.01 * soft {
+            value += step * (4.0 * pattern.soft_mm / reach).min(1.0);
+            if reach < 0.01 * pattern.soft_mm {
                 break;
             }
         }
@@ -174,11 +206,18 @@ impl Edge {
     }
 
     /// Every point before the plane costs, being farther from the points costs too.
-    fn newton(&self, near: &[Along], value: &Vector3<f64>, soft: f64, free: bool) -> Option<Vector3<f64>> {
-        let mut slope = self.centre * self.before;
+    fn newton<'a>(
+        &self,
+        near: impl Iterator<Item = &'a Along>,
+        pattern: &Pattern,
+        value: &Vector3<f64>,
+        free: bool,
+    ) -> Option<Vector3<f64>> {
+        let soft = pattern.soft_mm;
+        let mut slope = pattern.centre * pattern.before;
         let mut bend = Matrix3::zeros();
         let reach = value.x + self.radius_mm * value.y.hypot(value.z) + soft;
-        for p in near.iter().take_while(|p| p[0] < reach) {
+        for p in near.take_while(|p| p[0] < reach) {
             let row = row(p);
             let share = 0.5 + (row.dot(value) - p[0]) / (2.0 * soft);
             if share > 0.0 {
@@ -201,6 +240,19 @@ impl Edge {
 
 fn row(p: &Along) -> Vector3<f64> {
     Vector3::new(1.0, p[1], p[2])
+}
+
+/// The arcs around the tube that each point is not in, a bit for each.
+fn outside_arcs(points: &[Along]) -> Vec<u16> {
+    let turn = std::f64::consts::TAU / ARCS as f64;
+    let half = turn.cos();
+    let middles: [(f64, f64); ARCS] = std::array::from_fn(|k| (turn * k as f64).sin_cos());
+    let bits = |p: &Along| {
+        let limit = half * p[1].hypot(p[2]);
+        let outside = middles.iter().map(|(sin, cos)| p[1] * cos + p[2] * sin < limit);
+        outside.enumerate().fold(0, |bits, (k, out)| bits | u16::from(out) << k)
+    };
+    points.iter().map(bits).collect()
 }
 
 #[cfg(test)]

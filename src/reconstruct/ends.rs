@@ -73,16 +73,19 @@ impl End {
 
 /// The end of a tube that lies along +x from it: `points` on and in the tube in a frame whose x axis is the tube's, of
 /// whose outside they scatter by `noise_mm`. None when too little was scanned there.
-pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, passes_mm: f64) -> Option<End> {
-    let outside = |p: &&Point3<f64>| OUTSIDE_SIGMAS.contains(&((p.y.hypot(p.z) - radius_mm) / noise_mm));
-    let surface: Vec<Point3<f64>> = points.iter().filter(outside).copied().collect();
+pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_mm: f64) -> Option<End> {
+    let inner: Vec<Point3<f64>> =
+        points.iter().filter(|p| face::may_hold(p, radius_mm, noise_mm)).copied().collect();
+    // Nearly all of the points, so they are not copied.
+    points.retain(|p| OUTSIDE_SIGMAS.contains(&((p.y.hypot(p.z) - radius_mm) / noise_mm)));
+    let surface = points;
     let outline = outline::find(&surface, radius_mm, noise_mm, passes_mm)?;
     let near_mm = DIFFERENT_SIGMAS * outline.sigma_mm + outline.step_mm.max(3.0 * noise_mm);
     let oblique = outline.loose_size() - DIFFERENT_SIGMAS * outline.loose_sigma > 0.5 * STEEPEST_FACES[0];
     let about =
         if oblique { (outline.loose_at_mm, outline.loose_slope) } else { (outline.at_mm, outline.slope) };
     let steepest = STEEPEST_FACES[usize::from(oblique)];
-    let face = face::find(points, radius_mm, noise_mm, &Search { about_mm: about.0, near_mm, steepest });
+    let face = face::find(&inner, radius_mm, noise_mm, &Search { about_mm: about.0, near_mm, steepest });
     let same = |f: &Face| {
         let room = near_mm / radius_mm;
         let off = |k: usize, v: f64| {
@@ -183,7 +186,7 @@ mod tests {
     }
 
     fn found(points: &[Point3<f64>]) -> Place {
-        match find(points, RADIUS, NOISE, 0.0) {
+        match find(points.to_vec(), RADIUS, NOISE, 0.0) {
             Some(End::Found(place)) => place,
             other => panic!("{other:?}"),
         }
@@ -249,21 +252,21 @@ mod tests {
 
     #[test]
     fn the_edge_of_the_scan_is_no_end() {
-        let Some(End::CutOff { slope_rad, .. }) = find(&half_tube(3.0, 0.6), RADIUS, NOISE, 0.0) else {
+        let Some(End::CutOff { slope_rad, .. }) = find(half_tube(3.0, 0.6), RADIUS, NOISE, 0.0) else {
             panic!("31 degrees from square is no saw's work");
         };
         assert!((slope_rad.to_degrees() - 31.0).abs() < 3.0, "{}", slope_rad.to_degrees());
         // Steps of two radii: no plane at all.
         let steps = |p: &Point3<f64>| p.x > 20.0 * (0.8 * p.z).sin().signum();
         let ragged: Vec<_> = half_tube(-20.0, 0.0).into_iter().filter(steps).collect();
-        assert!(!matches!(find(&ragged, RADIUS, NOISE, 0.0), Some(End::Found(_))));
+        assert!(!matches!(find(ragged, RADIUS, NOISE, 0.0), Some(End::Found(_))));
     }
 
     #[test]
     fn an_end_that_was_not_scanned_is_unknown() {
-        assert_eq!(find(&[], RADIUS, NOISE, 0.0), None);
-        assert_eq!(find(&half_tube(3.0, 0.0)[..2], RADIUS, NOISE, 0.0), None);
-        assert_eq!(find(&[Point3::new(f64::NAN, 0.0, 0.0)], RADIUS, NOISE, 0.0), None);
+        assert_eq!(find(Vec::new(), RADIUS, NOISE, 0.0), None);
+        assert_eq!(find(half_tube(3.0, 0.0)[..2].to_vec(), RADIUS, NOISE, 0.0), None);
+        assert_eq!(find(vec![Point3::new(f64::NAN, 0.0, 0.0)], RADIUS, NOISE, 0.0), None);
     }
 
     #[test]

@@ -48,12 +48,17 @@ pub struct Search {
     pub steepest: f64,
 }
 
-/// Looks for the face among `points`, in a frame whose x axis is the tube's and leads into it.
+/// Whether a point is too far from the outside to belong to it.
+pub fn may_hold(p: &Point3<f64>, radius_mm: f64, noise_mm: f64) -> bool {
+    p.y.hypot(p.z) < radius_mm - EDGE_SIGMAS * noise_mm
+}
+
+/// Looks for the face among those of `points` that it [may hold](may_hold), in a frame whose x axis is the tube's and leads
+/// into it.
 pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, place: &Search) -> Option<Face> {
-    let within = radius_mm - EDGE_SIGMAS * noise_mm;
     let reach = place.near_mm + place.steepest * radius_mm;
-    let inner = |p: &&Point3<f64>| p.y.hypot(p.z) < within && (p.x - place.about_mm).abs() < reach;
-    let mut candidates: Vec<Point3<f64>> = points.iter().filter(inner).copied().collect();
+    let near = |p: &&Point3<f64>| may_hold(p, radius_mm, noise_mm) && (p.x - place.about_mm).abs() < reach;
+    let mut candidates: Vec<Point3<f64>> = points.iter().filter(near).copied().collect();
     if candidates.len() < MIN_POINTS {
         return None;
     }

@@ -40,7 +40,7 @@ pub fn finish(
     sample: Vec<Point3<f64>>,
     chosen: &Structure,
 ) -> Result<Reconstruction, ReconstructError> {
-    let found = finish_as_chosen(cloud, scene.clone(), sample.clone(), chosen);
+    let found = finish_as_chosen(cloud, &scene, &sample, chosen);
     let Err(ReconstructError::Undetermined { bend, .. }) = &found else { return found };
     let bends = chosen.model.lra.bends.len();
     let (first, last) = (*bend == 1, *bend == bends);
@@ -48,7 +48,7 @@ pub fn finish(
         return found;
     }
     let less = Structure { model: without_bend(&chosen.model, bend - 1), ..chosen.clone() };
-    let mut trimmed = finish_as_chosen(cloud, scene, sample, &less)?;
+    let mut trimmed = finish_as_chosen(cloud, &scene, &sample, &less)?;
     forget_end(&mut trimmed.measured, first);
     Ok(trimmed)
 }
@@ -82,8 +82,8 @@ fn forget_end(tube: &mut MeasuredTube, first: bool) {
 
 fn finish_as_chosen(
     cloud: &PointCloud,
-    scene: Scene,
-    sample: Vec<Point3<f64>>,
+    scene: &Scene,
+    sample: &[Point3<f64>],
     chosen: &Structure,
 ) -> Result<Reconstruction, ReconstructError> {
     let mut whole = Whole::new(cloud, scene.own.as_deref());
@@ -97,9 +97,8 @@ fn finish_as_chosen(
     best.covariance = profile::tightened(&best.information, &best.parameters, &chosen.held);
     let correlation = correlation(&whole, &best);
     best.covariance *= correlation.near;
-    let mut ends = end_points(&whole, sample, &best);
-    let mut measured =
-        measure::measure(&mut best, &mut ends, (correlation.along_arc / correlation.near).sqrt());
+    let ends = end_points(&whole, sample, &best);
+    let mut measured = measure::measure(&mut best, ends, (correlation.along_arc / correlation.near).sqrt());
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
@@ -107,7 +106,7 @@ fn finish_as_chosen(
     measured.residual_median_mm = best.median_mm;
     measured.decisions.clone_from(&chosen.decisions);
     measured.points_total = cloud.len();
-    measured.warnings.splice(0..0, scene.warnings);
+    measured.warnings.splice(0..0, scene.warnings.iter().cloned());
     let TubeModel { lra, ovality_mm, .. } = best.model.clone();
     Ok(Reconstruction { measured, spine: best.model.spine(), lra, ovality_mm })
 }
@@ -119,12 +118,12 @@ fn fit_to_all(whole: &mut Whole, chosen: &Structure) -> Fit {
     polish(whole, &chosen.model, effort, &chosen.held).unwrap_or_else(|| fit(whole, &chosen.model, effort))
 }
 
-/// The points that show the tube's ends.
-fn end_points(whole: &Whole, sample: Vec<Point3<f64>>, fit: &Fit) -> Sample {
+/// The points that show the tube's ends, see [`Whole::ends`].
+fn end_points(whole: &Whole, sample: &[Point3<f64>], fit: &Fit) -> [Vec<Point3<f64>>; 2] {
     if whole.len() <= MANY_POINTS {
         return whole.ends(&fit.model, fit.cutoff_mm, f64::INFINITY, f64::INFINITY);
     }
-    let mut sample = Sample::new(sample, &fit.model);
+    let mut sample = Sample::new(sample.to_vec(), &fit.model);
     let per_radius = whole.len() as f64 * fit.model.tube_radius_mm / fit.model.spine().length_mm();
     let radii = (END_POINTS / per_radius).clamp(*END_RADII.start(), *END_RADII.end());
     let (first_mm, last_mm) = reaches(&mut sample, &fit.model, radii * fit.model.tube_radius_mm);

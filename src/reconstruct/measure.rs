@@ -1,12 +1,12 @@
 //! From the fit to measured values: ends, sigmas from the full covariance, unknown where the data is silent.
 
-use nalgebra::{DMatrix, DVector, Point3, Vector3};
+use nalgebra::{DMatrix, DVector, Point3};
 
 use super::ends::{self, End};
 use super::fit::Fit;
 use super::model::{Parameter, TubeModel};
-use super::moments::Sample;
 use super::passes;
+use super::whole::end_frames;
 use crate::tube::{Frame, MeasuredBend, MeasuredTube, Spine};
 
 /// Above these a value is not given (design: null with a warning, never a guess).
@@ -41,10 +41,10 @@ pub(super) struct Values {
     pub tube_radius: Vec<f64>,
 }
 
-/// Sets the end straights' lengths from the scanned extent and puts sigmas beside all values; the radii's are `radius_doubt`
-/// times what the covariance says.
-pub fn measure(fit: &mut Fit, sample: &mut Sample, radius_doubt: f64) -> MeasuredTube {
-    let Scanned { ends, first, last } = set_ends(fit, sample);
+/// Sets the end straights' lengths from the points of both [ends](super::whole::Whole::ends) and puts sigmas beside all
+/// values; the radii's are `radius_doubt` times what the covariance says.
+pub fn measure(fit: &mut Fit, end_points: [Vec<Point3<f64>>; 2], radius_doubt: f64) -> MeasuredTube {
+    let Scanned { ends, first, last } = set_ends(fit, end_points);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
     let jacobian = jacobian(&fit.model, &fit.parameters, &ends);
@@ -61,7 +61,7 @@ pub fn measure(fit: &mut Fit, sample: &mut Sample, radius_doubt: f64) -> Measure
     MeasuredTube {
         tube_radius_mm: report.at.tube_radius[0],
         tube_radius_sigma_mm: Some(report.sigma.tube_radius[0]),
-        points_total: sample.points.len(),
+        points_total: 0,
         points_used: fit.used,
         residual_median_mm: 0.0,
         elapsed_ms: 0.0,
@@ -210,30 +210,13 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, sample: &mut Sample) -> Scanned {
-    sample.residuals(&fit.model);
-    let sample = &*sample;
-    let spine = fit.model.spine();
-    let last_segment = spine.segments().len() - 1;
+fn set_ends(fit: &mut Fit, [first_points, last_points]: [Vec<Point3<f64>>; 2]) -> Scanned {
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
-    let own = |segment: usize, frame: &Frame, length_mm: f64| -> Vec<Point3<f64>> {
-        let inverse = frame.inverse();
-        let mine = sample.points.iter().zip(sample.segments()).filter(|(_, s)| **s as usize == segment);
-        mine.map(|(p, _)| inverse * p).filter(|p| p.x <= length_mm).collect()
-    };
-    // Both looked at along the way into the tube.
-    let (first_segment, end_segment) = (&spine.segments()[0], &spine.segments()[last_segment]);
-    let first_frame = first_segment.start;
-    let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
-    let last_frame = spine.frame_at(spine.length_mm()) * back;
-    let (first_points, last_points) = rayon::join(
-        || own(0, &first_frame, first_segment.length_mm),
-        || own(last_segment, &last_frame, end_segment.length_mm),
-    );
+    let [first_frame, last_frame] = end_frames(&fit.model.spine());
     let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise);
     let (first, last) = rayon::join(
-        || ends::find(&first_points, radius, noise, passes_mm),
-        || ends::find(&last_points, radius, noise, passes_mm),
+        || ends::find(first_points, radius, noise, passes_mm),
+        || ends::find(last_points, radius, noise, passes_mm),
     );
     let model = &mut fit.model;
     if let Some(end) = last {

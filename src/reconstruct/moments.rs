@@ -127,12 +127,6 @@ impl Sample {
         Sample { points, segment }
     }
 
-    /// Points whose segments are known.
-    pub(super) fn settled(points: impl Iterator<Item = (Point3<f64>, u32)>) -> Sample {
-        let (points, segment) = points.unzip();
-        Sample { points, segment }
-    }
-
     /// Signed distances of all points from the model's surface; also moves each point to its segment.
     pub fn residuals(&mut self, model: &TubeModel) -> Vec<f64> {
         let locals = prepare(model);

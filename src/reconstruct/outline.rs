@@ -169,7 +169,7 @@ struct Sector {
 impl Rim<'_> {
     fn new(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64) -> Option<Rim<'_>> {
         let mut along: Vec<f64> = points.iter().map(|p| p.x).collect();
-        along.sort_by(f64::total_cmp);
+        along.sort_unstable_by(f64::total_cmp);
         let first_mm = solid_start(&along, 2.0 * radius_mm)?;
         let step_mm = step_mm(points, first_mm, radius_mm)?;
         let around = std::f64::consts::TAU * radius_mm;

@@ -4,6 +4,8 @@
 //! After the fit, on sums of all points over short stretches of the tube, taken in one walk (`whole`). What is judged
 //! is as in `sections`: the shift, the size and the ovality of every stretch's own best section.
 
+use std::collections::VecDeque;
+
 use nalgebra::Vector3;
 
 use super::fit::Fit;
@@ -42,13 +44,13 @@ pub fn correlation(whole: &Whole, fit: &Fit) -> Correlation {
     let radius = model.tube_radius_mm;
     let bins = Bins::new(&spine, radius, whole.len());
     let locals = prepare(model);
-    let new = || vec![[0.0; 21]; bins.total];
-    let parts = whole.walk(model, fit.cutoff_mm, new, |sums: &mut Vec<Flat>, k, p| {
-        add(&mut sums[bins.of(k, locals[k].share_along(p))], &locals[k], p, radius, fit.cutoff_mm);
+    let parts = whole.walk(model, fit.cutoff_mm, Run::default, |run, k, p| {
+        add(run.at(bins.of(k, locals[k].share_along(p))), &locals[k], p, radius, fit.cutoff_mm);
     });
-    let mut total = new();
+    let mut total = vec![[0.0; 21]; bins.total];
     for part in &parts {
-        total.iter_mut().zip(part).for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(a, b)| *a += b));
+        let total = total[part.first..].iter_mut().zip(&part.sums);
+        total.for_each(|(a, b)| a.iter_mut().zip(b).for_each(|(a, b)| *a += b));
     }
     let places = bins.places().zip(bins.places_mm()).zip(&total);
     let judged = places.filter(|(_, sums)| sums[0] >= JUDGED_POINTS);
@@ -59,6 +61,31 @@ pub fn correlation(whole: &Whole, fit: &Fit) -> Correlation {
     let scatter = (median(&mut excess).unwrap_or(0.0) / MEDIAN_CHI2).max(1.0);
     let factor = |farthest| scatter * persistence(&offs, farthest);
     Correlation { near: factor(NEAR), along_arc: factor(ALONG_ARC) }
+}
+
+/// Sums of neighbouring stretches: those that a part of the file has points of, mostly a few of them.
+#[derive(Default)]
+struct Run {
+    first: usize,
+    sums: VecDeque<Flat>,
+}
+
+impl Run {
+    /// The sums of a stretch, which is among them from then on.
+    fn at(&mut self, stretch: usize) -> &mut Flat {
+        if self.sums.is_empty() {
+            self.first = stretch;
+        }
+        while stretch < self.first {
+            self.sums.push_front([0.0; 21]);
+            self.first -= 1;
+        }
+        let at = stretch - self.first;
+        if at >= self.sums.len() {
+            self.sums.resize(at + 1, [0.0; 21]);
+        }
+        &mut self.sums[at]
+    }
 }
 
 /// A stretch by itself.
@@ -106,4 +133,19 @@ fn own(sums: &Flat, model: &TubeModel, spine: &Spine, (segment, at_mm): (usize, 
     let outward = if segment % 2 == 1 { -1.0 } else { 1.0 };
     let off = Vector3::new(0.0, outward * values[1], values[2]);
     Own { excess, off_mm: spine.frame_at(at_mm).rotation * off }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_holds_its_stretches_in_whatever_order_they_come() {
+        let mut run = Run::default();
+        for stretch in [5, 9, 2, 5, 2, 3] {
+            run.at(stretch)[0] += stretch as f64;
+        }
+        let sums: Vec<f64> = run.sums.iter().map(|s| s[0]).collect();
+        assert_eq!((run.first, sums), (2, vec![4.0, 3.0, 0.0, 10.0, 0.0, 0.0, 0.0, 9.0]));
+    }
 }

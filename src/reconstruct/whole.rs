@@ -3,15 +3,16 @@
 //! Between `finish` and the cloud. A point is looked for where the one before it was: in a file's order that is nearly
 //! always the same segment, and the surface there tells. Only where it does not are all segments asked.
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 use super::fit::Data;
 use super::lanes::Adder;
-use super::local::{Local, prepare};
+use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
-use super::moments::{CHUNK, Pass, Sample};
+use super::moments::{CHUNK, Pass};
 use crate::cloud::PointCloud;
+use crate::tube::{Frame, Spine};
 
 /// Chunks at most: their sums take room.
 const MOST_CHUNKS: usize = 64;
@@ -98,18 +99,48 @@ impl<'a> Whole<'a> {
     }
 
     /// The points of the first and of the last straight that lie no farther along it than `first_mm`, or no farther
-    /// from its end than `last_mm`.
-    pub fn ends(&self, model: &TubeModel, near_mm: f64, first_mm: f64, last_mm: f64) -> Sample {
-        let spine = model.spine();
+    /// from its end than `last_mm`; each in the frame of its [end](end_frames).
+    pub fn ends(
+        &self,
+        model: &TubeModel,
+        near_mm: f64,
+        first_mm: f64,
+        last_mm: f64,
+    ) -> [Vec<Point3<f64>>; 2] {
+        let (spine, locals) = (model.spine(), prepare(model));
         let last = spine.segments().len() - 1;
         let from_last = spine.segments()[last].length_mm - last_mm;
-        let parts = self.walk(model, near_mm, Vec::new, |kept, segment, p| {
+        let into = end_frames(&spine).map(|frame| frame.inverse());
+        let ends = [0, last].map(|k| (k as u32, spine.segments()[k].length_mm)).into_iter().zip(into);
+        let parts = self.walk(model, near_mm, <[Vec<_>; 2]>::default, |kept, segment, p| {
             if (segment == 0 && p[0] <= first_mm) || (segment == last && p[0] >= from_last) {
-                kept.push((spine.segments()[segment].start * Point3::from(p), segment as u32));
+                let point = spine.segments()[segment].start * Point3::from(p);
+                let mut own = segment as u32;
+                settle(&point, &mut own, &locals);
+                for (kept, ((k, length_mm), into)) in kept.iter_mut().zip(ends.clone()) {
+                    let point = into * point;
+                    if own == k && point.x <= length_mm {
+                        kept.push(point);
+                    }
+                }
             }
         });
-        Sample::settled(parts.into_iter().flatten())
+        let (first, last) = parts.into_iter().map(|[first, last]| (first, last)).unzip();
+        [joined(first), joined(last)]
     }
+}
+
+/// The frames of a tube's ends: x leads into the tube.
+pub fn end_frames(spine: &Spine) -> [Frame; 2] {
+    let back = Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
+    [spine.segments()[0].start, spine.frame_at(spine.length_mm()) * back]
+}
+
+/// All parts in one, each given back as soon as it is in there.
+fn joined<T>(parts: Vec<Vec<T>>) -> Vec<T> {
+    let mut all = Vec::with_capacity(parts.iter().map(Vec::len).sum());
+    parts.into_iter().for_each(|part| all.extend(part));
+    all
 }
 
 impl Data for Whole<'_> {
@@ -201,8 +232,8 @@ pub fn residuals_mm(cloud: &PointCloud, model: &TubeModel) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tube::{Bend, Frame, Lra};
-    use nalgebra::Vector3;
+    use crate::reconstruct::moments::Sample;
+    use crate::tube::{Bend, Lra};
 
     /// A tube that comes back on itself, with points on, in and around it, in no order.
     fn case(points: usize) -> (TubeModel, PointCloud) {
@@ -250,6 +281,29 @@ mod tests {
         assert!((found.cost / expected.cost - 1.0).abs() < 1e-9);
         for (a, b) in found.moments.iter().zip(&expected.moments) {
             assert!((a - b).amax() <= 1e-9 * b.amax());
+        }
+    }
+
+    #[test]
+    fn each_end_gets_the_points_of_its_straight_in_its_own_frame() {
+        let (model, cloud) = case(5000);
+        let spine = model.spine();
+        let points: Vec<_> = cloud.iter().collect();
+        let mut sample = Sample::new(points.clone(), &model);
+        sample.residuals(&model);
+        let all = Whole::new(&cloud, None);
+        let found = all.ends(&model, 0.2, f64::INFINITY, f64::INFINITY);
+        let segments = [0, spine.segments().len() - 1];
+        for ((frame, segment), found) in end_frames(&spine).iter().zip(segments).zip(&found) {
+            let mine = points.iter().zip(sample.segments()).filter(|(_, s)| **s as usize == segment);
+            let mine: Vec<_> = mine.map(|(p, _)| frame.inverse() * p).collect();
+            assert!(mine.len() > 500 && mine.len() == found.len());
+            assert!(mine.iter().zip(found).all(|(a, b)| (a - b).norm() < 1e-9));
+        }
+        let some = all.ends(&model, 0.2, 10.0, 20.0);
+        for ((some, found), reach_mm) in some.iter().zip(&found).zip([10.0, 20.0]) {
+            let near: Vec<_> = found.iter().filter(|p| p.x <= reach_mm).copied().collect();
+            assert_eq!(*some, near);
         }
     }
 
