@@ -2,9 +2,9 @@
 //!
 //! Values are separated by white space, commas or semicolons, whichever the first data line uses: held
 //! through the whole file, so that a decimal comma is refused and never read as two columns. Also here: lines
-//! and numbers with their place, which ascii PLY uses too.
+//! and numbers with their place, which ascii PLY and STL use too. Lines end with \n, \r\n or \r.
 
-use memchr::{memchr, memchr_iter};
+use memchr::{memchr_iter, memchr2};
 use rayon::prelude::*;
 
 use super::CloudError;
@@ -51,12 +51,20 @@ impl<'a> Lines<'a> {
     /// The first `bytes` bytes, and on to the end of the line.
     fn cut(&mut self, bytes: usize) -> Lines<'a> {
         let begin = self.clone();
-        let line = self.rest.get(bytes..).and_then(|later| memchr(b'\n', later));
-        let (piece, rest) = self.rest.split_at(line.map_or(self.rest.len(), |end| bytes + end + 1));
+        let later = self.rest.get(bytes..).unwrap_or_default();
+        let (piece, rest) = self.rest.split_at(self.rest.len() - ended(later).1.len());
         self.rest = rest;
-        self.number += memchr_iter(b'\n', piece).count();
+        let alone = |at: &usize| piece.get(at + 1) != Some(&b'\n');
+        self.number += memchr_iter(b'\n', piece).count() + memchr_iter(b'\r', piece).filter(alone).count();
         Lines { rest: piece, ..begin }
     }
+}
+
+/// A text's first line without its ending, and what comes after.
+fn ended(text: &[u8]) -> (&[u8], &[u8]) {
+    let Some(end) = memchr2(b'\n', b'\r', text) else { return (text, &[]) };
+    let (line, rest) = text.split_at(end);
+    (line, rest.strip_prefix(b"\r\n").unwrap_or(&rest[1..]))
 }
 
 /// Passes lines to `each` on all cores, cut into pieces, and what it made of each piece to `put`, in order. Of
@@ -90,11 +98,7 @@ impl<'a> Iterator for Lines<'a> {
 
     fn next(&mut self) -> Option<Line<'a>> {
         while !self.rest.is_empty() {
-            let end = memchr(b'\n', self.rest);
-            let (text, rest) = match end {
-                Some(end) => (&self.rest[..end], &self.rest[end + 1..]),
-                None => (self.rest, &[][..]),
-            };
+            let (text, rest) = ended(self.rest);
             self.rest = rest;
             self.number += 1;
             let text = text.trim_ascii_end();

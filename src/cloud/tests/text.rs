@@ -1,6 +1,49 @@
 //! Text scans: dialects, faults with line and column.
 
+use super::ply::header;
 use super::*;
+
+/// The same text with each line ended in another way; with `None` in all ways in turn.
+fn with_endings(text: &str, ending: Option<&str>) -> Vec<u8> {
+    let ways = ["\r", "\r\n", "\n", "\r"];
+    let line = |(i, line): (usize, &str)| line.to_owned() + ending.unwrap_or(ways[i % ways.len()]);
+    text.lines().enumerate().map(line).collect::<String>().into_bytes()
+}
+
+#[test]
+fn lines_may_end_in_a_bare_carriage_return_in_every_text_format() {
+    // Enough for several pieces, which are read side by side.
+    let points: Vec<_> =
+        (0..60_000).map(|i| Point3::new(f64::from(i % 300), f64::from(i / 300), 0.25)).collect();
+    let rows = |separator: &str| text(&points, separator);
+    let corner = |p: &Point3<f64>| format!("vertex {} {} {}\n", p.x, p.y, p.z);
+    let corners: String = points.iter().map(corner).collect();
+    // Each with the number of lines before its points, a blank one among them where the format allows it.
+    let files = [
+        ("s.xyz", rows(" "), 0),
+        ("s.asc", format!("# scan\n\n{}", rows("  ")), 2),
+        ("s.pts", format!("60000\n{}", rows(" ")), 1),
+        ("s.csv", format!("x,y,z\n\n{}", rows(",")), 2),
+        ("s.txt", rows("\t"), 0),
+        ("s.ply", header("ascii", "60000") + &rows(" "), 7),
+        ("s.stl", format!("solid s\n\n{corners}endsolid\n"), 2),
+    ];
+    for (name, file, before) in files {
+        for ending in [Some("\n"), Some("\r"), Some("\r\n"), None] {
+            let scan = accepted(name, &with_endings(&file, ending));
+            assert_eq!(error_mm(&scan.cloud, &points), 0.0, "{name} {ending:?}");
+            assert!(scan.notes.is_empty(), "{name} {ending:?}: {:?}", scan.notes);
+            // The line is the one that an editor shows.
+            for row in [0, 29_999, 59_999] {
+                let mut lines: Vec<&str> = file.lines().collect();
+                let bad = lines[before + row].replacen("0.25", "0.2x5", 1);
+                lines[before + row] = &bad;
+                let place = format!("{name}, line {},", before + row + 1);
+                says(&refusal(name, &with_endings(&lines.join("\n"), ending)), &[&place, "\"0.2x5\""]);
+            }
+        }
+    }
+}
 
 #[test]
 fn text_in_all_its_dialects() {
