@@ -6,10 +6,10 @@ use super::*;
 use ::e57 as format;
 
 /// A pose; points in metres, each with its state.
-type E57Scan = (Option<format::Transform>, Vec<([f64; 3], i64)>);
+pub(super) type E57Scan = (Option<format::Transform>, Vec<([f64; 3], i64)>);
 
 /// Scans of points in metres, with state (0 valid, 2 invalid), each with a pose.
-fn e57(scans: &[E57Scan], xml: fn(String) -> String) -> Vec<u8> {
+pub(super) fn e57(scans: &[E57Scan], xml: impl Fn(String) -> String) -> Vec<u8> {
     use format::{E57Writer, Record, RecordDataType, RecordName, RecordValue};
     let mut out = std::io::Cursor::new(Vec::new());
     let mut writer = E57Writer::new(&mut out, "test").unwrap();
@@ -34,7 +34,7 @@ fn e57(scans: &[E57Scan], xml: fn(String) -> String) -> Vec<u8> {
     out.into_inner()
 }
 
-fn metres(points: &[Point3<f64>]) -> Vec<([f64; 3], i64)> {
+pub(super) fn metres(points: &[Point3<f64>]) -> Vec<([f64; 3], i64)> {
     points.iter().map(|p| ((p / 1000.0).coords.into(), 0)).collect()
 }
 
@@ -78,7 +78,7 @@ fn an_e57_that_lies_or_is_cut_or_is_none() {
     let many = e57(&good(), |xml| xml.replace("recordCount=\"400\"", "recordCount=\"4000000000\""));
     says(&refusal("s.e57", &many), &["4000000000 points announced"]);
     let more = e57(&good(), |xml| xml.replace("recordCount=\"400\"", "recordCount=\"402\""));
-    says(&refusal("s.e57", &more), &["s.e57"]);
+    says(&refusal("s.e57", &more), &["402 points announced", "400 found"]);
     // Values of no bits: a file of a kilobyte could claim any number of points.
     let nothing = e57(&good(), |xml| {
         let empty = |xml: String, axis: &str| {
@@ -87,8 +87,8 @@ fn an_e57_that_lies_or_is_cut_or_is_none() {
         };
         ["X", "Y", "Z"].into_iter().fold(xml, empty).replace("maximum=\"2\"", "maximum=\"0\"")
     });
-    says(&refusal("s.e57", &nothing), &["no point that differs"]);
-    says(&refusal("s.e57", &e57(&[], |xml| xml)), &["0 points"]);
+    says(&refusal("s.e57", &nothing), &["0 bits each", "at least 24"]);
+    says(&refusal("s.e57", &e57(&[], |xml| xml)), &["no scan in it"]);
     let nan = e57(&[(None, vec![([f64::NAN, 0.0, 0.0], 0); 200])], |xml| xml);
     says(&refusal("s.e57", &nan), &["200 of 200 points"]);
 }

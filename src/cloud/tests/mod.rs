@@ -1,6 +1,7 @@
 //! The door as its users see it: every variant of every format read alike, every bad file refused with the reason.
 
 mod e57;
+mod e57_hostile;
 mod ply;
 mod stl;
 mod streams;
