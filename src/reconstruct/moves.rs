@@ -24,6 +24,10 @@ const PAIRS: usize = 4;
 /// A straight no longer than this, in tube radii, is none.
 const NO_STRAIGHT: f64 = 0.05;
 
+/// A turn no larger than this is none (0.6 degrees), and CLRs this near to each other are one.
+const NO_TURN_RAD: f64 = 0.01;
+const SAME_RADIUS: f64 = 0.02;
+
 /// A bend this much wider than the mean may be two.
 const WIDE: f64 = 1.3;
 
@@ -95,6 +99,14 @@ pub fn is_free_form(lra: &Lra, tube_radius_mm: f64) -> bool {
     let seamless = |b: &&Bend| b.length_mm < 0.2 * tube_radius_mm && b.rotation_rad.abs() < 0.3;
     let joints = lra.bends.iter().skip(1).filter(seamless).count();
     joints >= FREE_FORM_JOINTS && 2 * joints >= lra.bends.len()
+}
+
+/// Whether bends `i - 1` and `i` are one for any bender: the same CLR in the same plane with no straight between.
+pub fn is_one(model: &TubeModel, i: usize) -> bool {
+    let (one, other) = (model.lra.bends[i - 1], model.lra.bends[i]);
+    other.length_mm < NO_STRAIGHT * model.tube_radius_mm
+        && other.rotation_rad.abs() < NO_TURN_RAD
+        && (one.radius_mm / other.radius_mm).ln().abs() < SAME_RADIUS
 }
 
 /// Bends `i - 1` and `i` as one: an arc over both when they turn in about one plane the same way, or, shallow ones in any

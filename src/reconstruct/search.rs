@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::evidence::{Joint, Solved};
 use super::fit::{RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
-use super::moves::{doubled, drawn_apart, likeliest_pairs, merged, split, with_bend, without_bend};
+use super::moves::{doubled, drawn_apart, is_one, likeliest_pairs, merged, split, with_bend, without_bend};
 use super::sections::CentreLine;
 use crate::tube::Decision;
 
@@ -192,6 +192,26 @@ impl Jury {
         }
         self.decide(format!("a bend put in at {:.0} mm", joint.at_mm), None, gain, true);
         Some(more)
+    }
+
+    /// The tube with pairs of bends made one that are one for any bender, unless much speaks against it.
+    pub(super) fn united(&mut self, mut best: Candidate) -> Candidate {
+        let mut i = 1;
+        while i < best.bends() {
+            let one = is_one(&best.model, i).then(|| merged(&best.model, i)).flatten();
+            let fitted = one.map(|m| self.fit(&m, FULL_STEPS, f64::INFINITY));
+            let bearable = best.score + DEAREST_NONE * self.price(5, 1);
+            match fitted.filter(|c| c.score < bearable) {
+                Some(less) => {
+                    let at_mm = best.model.spine().segments()[2 * i + 1].start_mm;
+                    let what = format!("the arcs that meet at {at_mm:.0} mm are one bend");
+                    self.decide(what, None, best.score - less.score, true);
+                    best = less;
+                }
+                None => i += 1,
+            }
+        }
+        best
     }
 
     /// The tube without the bends that move it by no more than its scan's passes disagree.

@@ -120,6 +120,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     if jury.knowing_their_radius(&best) > 1 {
         best = jury.common(best);
     }
+    best = jury.united(best);
     let passes_mm = stripes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
     best = jury.material(best, passes_mm);
     Some(jury.confirmed(sample, best.model))
