@@ -48,6 +48,9 @@ const ABOVE_PASSES: f64 = 2.75;
 /// One that explains more than so many bends' price is none of the passes' making.
 const DEAREST_NONE: f64 = 3.0;
 
+/// An angle within so many standard deviations of zero is not known.
+const UNSURE: f64 = 2.0;
+
 /// Steps of a fit, and of one that only has to show whether a change is worth it.
 pub(super) const FULL_STEPS: usize = 100;
 const TRIAL_STEPS: usize = 40;
@@ -194,11 +197,13 @@ impl Jury {
         Some(more)
     }
 
-    /// The tube with pairs of bends made one that are one for any bender, unless much speaks against it.
+    /// The tube with neighbouring bends made one that are one for any bender, or of which one has an angle that is not
+    /// known at all, unless much speaks against it.
     pub(super) fn united(&mut self, mut best: Candidate) -> Candidate {
         let mut i = 1;
         while i < best.bends() {
-            let one = is_one(&best.model, i).then(|| merged(&best.model, i)).flatten();
+            let one = is_one(&best.model, i) || self.is_unsure(&best, i - 1) || self.is_unsure(&best, i);
+            let one = one.then(|| merged(&best.model, i)).flatten();
             let fitted = one.map(|m| self.fit(&m, FULL_STEPS, f64::INFINITY));
             let bearable = best.score + DEAREST_NONE * self.price(5, 1);
             match fitted.filter(|c| c.score < bearable) {
@@ -212,6 +217,15 @@ impl Jury {
             }
         }
         best
+    }
+
+    /// Whether a bend's angle is not known from zero.
+    fn is_unsure(&self, best: &Candidate, i: usize) -> bool {
+        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+        let variance = self.line.noise_mm.powi(2) * self.correlation;
+        let at = best.parameters.iter().position(|p| *p == Parameter::Angle(i));
+        let angle_rad = best.model.lra.bends[i].angle_rad;
+        at.is_some_and(|j| angle_rad.powi(2) < UNSURE.powi(2) * solved.inverse[(j, j)] * variance)
     }
 
     /// The tube without the bends that move it by no more than its scan's passes disagree.

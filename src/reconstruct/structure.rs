@@ -42,6 +42,9 @@ const KNOWN_RADIUS: f64 = 0.1;
 /// How many bends' price one CLR for all may be behind before its own search.
 const DEAREST_COMMON: f64 = 20.0;
 
+/// A bend nearer to an end than so many tube radii must be confirmed by the points, however clear it is.
+const END_RADII: f64 = 2.0;
+
 /// Times that the sections are measured anew about the best tube.
 const MEASUREMENTS: usize = 4;
 
@@ -189,6 +192,9 @@ impl Jury {
             let bends = &best.model.lra.bends;
             let bearable = DOUBT * self.price(5, 1) * self.correlation;
             let doubtful = |i: &usize| {
+                if self.is_at_an_end(&best.model, *i) {
+                    return true;
+                }
                 let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
                 at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
             };
@@ -205,6 +211,14 @@ impl Jury {
             self.decide(what, None, score - better.1, true);
             (best, score) = better;
         }
+    }
+
+    /// Whether a bend is so near to an end that burr, bore and face are in its sections.
+    fn is_at_an_end(&self, model: &TubeModel, i: usize) -> bool {
+        let near_mm = END_RADII * model.tube_radius_mm;
+        let bends = &model.lra.bends;
+        (i == 0 && bends[0].length_mm < near_mm)
+            || (i + 1 == bends.len() && model.lra.last_length_mm < near_mm)
     }
 
     fn fit_points(&self, sample: &mut Sample, model: &TubeModel) -> (Fit, f64) {
