@@ -66,6 +66,12 @@ const MOST_GROWTH: f64 = 1.6;
 /// Sagitta across a face's narrow side in sigmas: a plane has none.
 const MOST_SAGITTA: f64 = 1.0;
 
+/// A uniform width reaches so many root mean squares to either side.
+const SIDE_WIDTHS: f64 = 1.732;
+
+/// Radius of what bends so, in root mean square lengths of the face, from which on it is no tube.
+const ROUND_LENGTHS: f64 = 4.0;
+
 /// Doming of a face's patches that is no chance.
 const DOME_SIGMAS: f64 = 4.0;
 
@@ -373,8 +379,11 @@ impl Search<'_> {
             }
         }
         points.sort_unstable();
-        let curved =
-            sagitta(&bow, &inner).abs() > MOST_SAGITTA * sigma_mm || dome.is_round(sigma_mm, plane.length_mm);
+        let bow_mm = sagitta(&bow, &inner).abs();
+        // Passes that drift bow a table a little; what is round for a tube is so within its own length.
+        let round = (SIDE_WIDTHS * plane.width_mm).powi(2) < 2.0 * bow_mm * ROUND_LENGTHS * plane.length_mm;
+        let bowed = bow_mm > MOST_SAGITTA * sigma_mm && round;
+        let curved = bowed || dome.is_round(sigma_mm, plane.length_mm);
         let grows = wider as f64 > MOST_GROWTH * core as f64;
         let face = Face { normal: plane.normal, offset_mm: plane.offset_mm, sigma_mm, points };
         (!curved && !grows).then_some(face)
@@ -414,8 +423,7 @@ fn sagitta(powers: &[f64; 5], right: &[f64; 3]) -> f64 {
     let [s0, s1, s2, s3, s4] = *powers;
     let normal = Matrix3::new(s0, s1, s2, s1, s2, s3, s2, s3, s4);
     let solved = normal.cholesky().map(|c| c.solve(&Vector3::from(*right)));
-    // A uniform width reaches 1.7 root mean squares to either side.
-    solved.map_or(0.0, |c| c[2] * 3.0)
+    solved.map_or(0.0, |c| c[2] * SIDE_WIDTHS * SIDE_WIDTHS)
 }
 
 #[cfg(test)]

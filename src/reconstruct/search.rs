@@ -40,7 +40,7 @@ const MOVED: usize = 3;
 const DEAREST_MOVED: f64 = 8.0;
 
 /// A joint that takes away such a share of all misfit is looked into, however large the misfit.
-const EXPLAINED: f64 = 0.2;
+const EXPLAINED: f64 = 0.05;
 
 /// A bend must move the tube by this many times what the passes lie apart: of passes 20 to 80 micrometres apart the bends that
 /// were none moved it by 1.1 to 2.7 times that, true ones by 3 and more.
@@ -129,6 +129,10 @@ impl Jury {
     /// are remembered.
     pub(super) fn search(&mut self, mut best: Candidate) -> Candidate {
         for _ in 0..ROUNDS {
+            if let Some(other) = self.explained(&best) {
+                best = other;
+                continue;
+            }
             let mut tried = self.tried(&best);
             tried.sort_by(|a, b| a.1.score.total_cmp(&b.1.score));
             let better = tried.first().is_some_and(|(_, c)| c.score < best.score - LEAST_GAIN);
@@ -136,7 +140,7 @@ impl Jury {
                 let (change, candidate) = tried.swap_remove(0);
                 self.decide(change.what, None, best.score - candidate.score, true);
                 best = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
-            } else if let Some(other) = self.moved(&best, &tried).or_else(|| self.explained(&best)) {
+            } else if let Some(other) = self.moved(&best, &tried) {
                 best = other;
             } else {
                 self.decisions.retain(|d| d.kept);
