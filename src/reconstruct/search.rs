@@ -179,16 +179,16 @@ impl Jury {
     /// are judged by what that one leaves.
     fn explained(&mut self, best: &Candidate) -> Option<Candidate> {
         let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
-        let joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
-        let joint = joints.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain))?;
         let misfit = (best.score - self.price(best.parameters.len(), best.bends())) * self.correlation;
-        if joint.gain < EXPLAINED * misfit {
-            return None;
-        }
-        let more = [with_bend(&best.model, &joint), split(&best.model, &joint)].concat();
-        let fitted: Vec<Candidate> =
-            more.par_iter().map(|m| self.fit(m, FULL_STEPS, f64::INFINITY)).collect();
-        let more = fitted.into_iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
+        let joints = self.joints(best, &solved, EXPLAINED * misfit);
+        let tried = |j: &Joint| {
+            let more = [with_bend(&best.model, j), split(&best.model, j)].concat();
+            more.into_iter().map(|m| (j.at_mm, m)).collect::<Vec<_>>()
+        };
+        let more: Vec<(f64, TubeModel)> = joints.iter().flat_map(tried).collect();
+        let fit = |(at_mm, model)| (at_mm, self.fit(&model, FULL_STEPS, f64::INFINITY));
+        let fitted: Vec<(f64, Candidate)> = more.into_par_iter().map(fit).collect();
+        let (at_mm, more) = fitted.into_iter().min_by(|a, b| a.1.score.total_cmp(&b.1.score))?;
         let before = self.correlation;
         self.correlation = self.line.correlation(&more.model).min(before);
         let (less, more) = (self.judge(best.model.clone()), self.judge(more.model));
@@ -197,7 +197,7 @@ impl Jury {
             self.correlation = before;
             return None;
         }
-        self.decide(format!("a bend put in at {:.0} mm", joint.at_mm), None, gain, true);
+        self.decide(format!("a bend put in at {at_mm:.0} mm"), None, gain, true);
         Some(more)
     }
 
@@ -286,7 +286,7 @@ impl Jury {
             let what = format!("the bends at {:.0} and {:.0} mm made one", at(i - 1), at(i));
             Some(change(what, Some(i - 1), merged(model, i)?))
         });
-        let joints = self.joints(best, &solved);
+        let joints = self.joints(best, &solved, JOINT_GAIN * self.correlation);
         let inserted = joints.iter().flat_map(|j| {
             let what = format!("a bend put in at {:.0} mm", j.at_mm);
             with_bend(model, j).into_iter().map(move |m| change(what.clone(), None, m))
@@ -307,11 +307,11 @@ impl Jury {
         all.filter(|c| c.model.lra.bends.len() <= MOST_BENDS).collect()
     }
 
-    /// Places where a joint would help, the most helpful first, no two close together.
-    fn joints(&self, best: &Candidate, solved: &Solved) -> Vec<Joint> {
+    /// Places where a joint would help by so much, the most helpful first, no two close together.
+    fn joints(&self, best: &Candidate, solved: &Solved, least_gain: f64) -> Vec<Joint> {
         let radius = best.model.tube_radius_mm;
         let mut joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
-        joints.retain(|j| j.gain > JOINT_GAIN * self.correlation);
+        joints.retain(|j| j.gain > least_gain);
         joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
         let mut out: Vec<Joint> = Vec::new();
         for joint in joints {

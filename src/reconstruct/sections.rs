@@ -18,7 +18,7 @@ use super::section::{
     solve,
 };
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
-use crate::tube::any_normal;
+use crate::tube::{Spine, any_normal};
 
 /// The same about a base that has been fitted, radius and ovality and all.
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
@@ -34,6 +34,10 @@ const FIRMNESS: f64 = 1.0;
 /// inside it is an end with its face and its bore (which do less harm).
 const MOST_OUTSIDE: f64 = 0.25;
 const MOST_STRANGERS: f64 = 0.5;
+/// So near to an end, in tube radii, and no more than such a share of the end straight, burr, bore and face are among the
+/// points however few they are: a bend would be found there for them.
+const END_RADII: f64 = 0.75;
+const END_SHARE: f64 = 0.375;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 
@@ -147,13 +151,14 @@ impl CentreLine {
             let segment = &spine.segments()[place];
             let frame = segment.frame_at(along);
             // Before the first fit the radius is a guess: all points may look like strangers.
-            if fitted && is_crowded(seen, fit, cutoff) {
+            let at_mm = segment.start_mm + along;
+            if fitted && (is_at_an_end(base, &spine, at_mm) || is_crowded(seen, fit, cutoff)) {
                 crowded.push(frame.translation.vector.into());
                 continue;
             }
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
             let oval_mm = [oval(base, place, along), 0.0];
-            doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, segment.start_mm + along));
+            doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, at_mm));
             let best = solve(&sums, &SPREADS.map(|s| s * base.tube_radius_mm), noise);
             let least = cost(&sums, &best).max(0.0);
             sections.push(Section {
@@ -357,6 +362,13 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
         }
     }
     Sums::from(sums)
+}
+
+/// Whether a place is where the end of the tube is seen.
+fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
+    let near = |straight_mm: f64| (END_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
+    let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
+    at_mm < near(first_mm) || spine.length_mm() - at_mm < near(base.lra.last_length_mm)
 }
 
 /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
