@@ -8,7 +8,7 @@ use nalgebra::{Point3, UnitQuaternion, Vector3};
 
 use super::model::TubeModel;
 use crate::cloud::PointCloud;
-use crate::tube::Frame;
+use crate::tube::{Bend, Frame};
 
 /// Points this near to the surface of an end straight are its own. It goes on while stretches of this length, in tube radii,
 /// hold such a share of the points that the one before them does; one that holds less than such a share of what is usual
@@ -86,6 +86,43 @@ pub fn reaching(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
         let before_mm = change_mm(&outward, first.length_mm);
         first.length_mm += before_mm;
         out.start *= Frame::translation(-before_mm, 0.0, 0.0);
+    }
+    let none_left = |first: &Bend| first.length_mm <= 0.0 || out.lra.last_length_mm <= 0.0;
+    if out.lra.bends.first().is_some_and(none_left) { trimmed(&out, points) } else { out }
+}
+
+/// The tube without those parts of its first and last arcs that lie beyond its points: nothing else holds them back.
+fn trimmed(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
+    let spine = model.spine();
+    let radius = model.tube_radius_mm;
+    let stretch_mm = STRETCH_RADII * radius;
+    let mut counts = vec![0usize; (spine.length_mm() / stretch_mm) as usize + 1];
+    for p in points {
+        let at = spine.closest(p);
+        if (at.distance_mm - radius).abs() < OWN_SHARE * radius {
+            counts[(at.arc_length_mm / stretch_mm) as usize] += 1;
+        }
+    }
+    let usual = points.len() as f64 / counts.len() as f64;
+    let holds = |c: &usize| *c as f64 > EMPTY_DENSITY * usual;
+    let (Some(first), Some(last)) = (counts.iter().position(holds), counts.iter().rposition(holds)) else {
+        return model.clone();
+    };
+    let (from_mm, to_mm) = (first as f64 * stretch_mm, (last + 1) as f64 * stretch_mm);
+    let mut out = model.clone();
+    let n = out.lra.bends.len();
+    let share = |i: usize, from: f64, to: f64| {
+        let arc = &spine.segments()[2 * i + 1];
+        let share = (to.min(arc.start_mm + arc.length_mm) - from.max(arc.start_mm)) / arc.length_mm;
+        if share > 0.0 && share < 1.0 { share } else { 1.0 }
+    };
+    if n > 0 && out.lra.last_length_mm <= 0.0 {
+        out.lra.bends[n - 1].angle_rad *= share(n - 1, 0.0, to_mm);
+    }
+    if n > 0 && out.lra.bends[0].length_mm <= 0.0 {
+        let share = share(0, from_mm, f64::INFINITY);
+        out.start = spine.frame_at((1.0 - share) * spine.segments()[1].length_mm);
+        out.lra.bends[0].angle_rad *= share;
     }
     out
 }
