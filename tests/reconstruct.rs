@@ -131,6 +131,21 @@ fn values_that_once_were_silently_wrong() {
     expect_right(Set::Thirty, &[114, 366, 30034, 50178]);
 }
 
+/// Where the tube is: a cylinder of half the radius on one side of it (62006), a table that flying points made rough and
+/// whose plane took half the tube (20136), a table bowed by its passes (63027), a tube whose ends were not followed
+/// (101, 62002).
+#[test]
+fn scenes_that_once_hid_the_tube() {
+    expect_right(Set::Hard, &[101, 20136, 62002, 62006, 63027]);
+}
+
+/// What the ends do to the search: a joint that dragged the end beyond the tube (62128), burr and bore taken for bends
+/// (61194, 63010, 63199), an arc that ran out into nothing (62057). And two arcs that are one bend (62).
+#[test]
+fn searches_that_once_were_led_astray() {
+    expect_right(Set::Hard, &[62, 61194, 62057, 62128, 63010, 63199]);
+}
+
 /// A table beyond the end (20012), a covariance without end (20032), a missing bend taken for noise (20184, 40266), shallow
 /// bends within a wide one (40189), a scan that shows half an S (280): miscounted or refused once.
 #[test]

@@ -528,4 +528,30 @@ mod tests {
         assert!(find_planes(&cylinder(500, 5.0, 50.0, 0.0), 0.0).is_empty());
         assert!(find_planes(&cylinder(5, 5.0, 50.0, 0.0), 3.0).is_empty());
     }
+
+    /// A table of 300 x 200 mm with a share of flying points above it; its height by `height_mm`.
+    fn table(flying: usize, height_mm: impl Fn(f64) -> f64) -> Vec<Point3<f64>> {
+        let sides = [Vector3::x() * 300.0, Vector3::y() * 200.0];
+        let mut points = sheet(6000, Point3::origin(), sides, 0.03, 5);
+        points.iter_mut().for_each(|p| p.z += height_mm(p.x));
+        let mut next = numbers(9);
+        points.extend((0..flying).map(|_| Point3::new(300.0 * next(), 200.0 * next(), 40.0 + 90.0 * next())));
+        points
+    }
+
+    #[test]
+    fn flying_points_do_not_make_a_table_rough() {
+        let faces = find_planes(&table(3000, |_| 0.0), 3.2);
+        assert_eq!(faces.len(), 1);
+        assert!((0.025..0.04).contains(&faces[0].sigma_mm), "{}", faces[0].sigma_mm);
+        let on_it = faces[0].points.iter().filter(|i| **i < 6000).count();
+        assert!(on_it > 5900, "{on_it}");
+    }
+
+    #[test]
+    fn a_table_that_passes_bow_by_twice_the_noise_is_a_face() {
+        let faces = find_planes(&table(0, |x| 0.06 * (x / 150.0).powi(2)), 3.2);
+        assert_eq!(faces.len(), 1);
+        assert!(faces[0].points.len() > 5800);
+    }
 }

@@ -166,3 +166,74 @@ impl Counts {
         (self.inside - last.map_or(0, |i| i + 1)) as f64 * self.stretch_mm
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tube::Lra;
+
+    const RADIUS: f64 = 10.0;
+
+    fn tube(first_mm: f64, last_mm: f64) -> TubeModel {
+        let bend = Bend { length_mm: first_mm, rotation_rad: 0.0, angle_rad: 1.0, radius_mm: 40.0 };
+        let lra = Lra { bends: vec![bend], last_length_mm: last_mm };
+        TubeModel::round(Frame::translation(-first_mm, 0.0, 0.0), lra, RADIUS)
+    }
+
+    /// Points of half the surface between two places along it.
+    fn points(model: &TubeModel, from_mm: f64, to_mm: f64) -> Vec<Point3<f64>> {
+        let spine = model.spine();
+        let place = |i: usize| {
+            let at = from_mm + (to_mm - from_mm) * (0.618_034 * i as f64).fract();
+            let turn = 3.0 * (0.414_214 * i as f64).fract();
+            spine.frame_at(at) * Point3::new(0.0, RADIUS * turn.cos(), RADIUS * turn.sin())
+        };
+        (0..4000).map(place).collect()
+    }
+
+    #[test]
+    fn straights_that_are_too_long_are_cut_to_where_the_points_stop() {
+        let whole = tube(100.0, 80.0);
+        let long = tube(160.0, 145.0);
+        let cut = reaching(&long, &points(&whole, 0.0, whole.spine().length_mm()));
+        let lengths = [(cut.lra.bends[0].length_mm, 100.0), (cut.lra.last_length_mm, 80.0)];
+        assert!(lengths.iter().all(|(found, right)| (found - right).abs() <= 5.0), "{lengths:?}");
+        let corner = |m: &TubeModel| m.spine().segments()[1].start * Point3::origin();
+        assert!((corner(&cut) - corner(&whole)).norm() < 1e-9, "the bend stays where it is");
+    }
+
+    #[test]
+    fn arcs_without_points_are_cut_off() {
+        let mut model = tube(100.0, 0.0);
+        let seen = points(&model, 0.0, model.spine().length_mm());
+        model.lra.bends[0].angle_rad = 4.0;
+        let cut = reaching(&model, &seen).lra.bends[0].angle_rad;
+        assert!((1.0..1.2).contains(&cut), "{cut}");
+        // The same from the other side.
+        let mut turned = tube(0.0, 100.0);
+        let (spine, length_mm) = (turned.spine(), turned.spine().length_mm());
+        let seen = points(&turned, 0.0, length_mm);
+        turned.lra.bends[0].angle_rad = 4.0;
+        turned.start = Frame::identity();
+        let off = spine.frame_at(length_mm);
+        let end = turned.spine().frame_at(160.0);
+        turned.start = off * Frame::translation(-100.0, 0.0, 0.0) * end.inverse();
+        let cut = reaching(&turned, &seen);
+        assert!((1.0..1.2).contains(&cut.lra.bends[0].angle_rad), "{cut:?}");
+        let last = cut.spine().frame_at(cut.spine().length_mm());
+        assert!((last.translation.vector - off.translation.vector).norm() < 1e-6);
+    }
+
+    #[test]
+    fn a_centre_line_is_drawn_on_along_its_points_and_no_farther() {
+        let straight: Vec<Point3<f64>> = (0..20).map(|i| Point3::new(3.0 * f64::from(i), 0.0, 0.0)).collect();
+        // The straight's points from -60 to 100; the polygon goes from 0 to 57.
+        let mut seen = points(&tube(500.0, 80.0), 240.0, 400.0);
+        seen.iter_mut().for_each(|p| p.x += 200.0);
+        let on = drawn_on(straight, 3.0, RADIUS, &PointCloud::from_points(&seen));
+        let (low, high) = on.iter().fold((0.0_f64, 0.0_f64), |(a, b), p| (a.min(p.x), b.max(p.x)));
+        assert!((-60.0..-45.0).contains(&low), "{low}");
+        assert!((85.0..100.0).contains(&high), "{high}");
+        assert!(on.iter().all(|p| p.y.hypot(p.z) < 0.1));
+    }
+}

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::evidence::Solved;
 use super::fit::{Data, RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
-use super::moves::{doubled, drawn_apart, merged, with_wide_doubled, without_bend};
+use super::moves::{doubled, drawn_apart, is_one, merged, with_wide_doubled, without_bend};
 use super::normal;
 use super::reach::reaching;
 use super::sections::CentreLine;
@@ -216,4 +216,17 @@ fn a_second_bend_of_an_s_shows_beside_one_whose_radius_nothing_tells() {
     let joints = solved.joints(&line, &fitted, &parameters, noise_mm);
     let best = joints.iter().map(|j| j.gain).fold(0.0, f64::max);
     assert!(best > 300.0, "{best}");
+}
+
+#[test]
+fn arcs_of_one_bend_are_known_as_such() {
+    let with = |length_mm, rotation_rad, radius_mm| {
+        let mut model = tube(vec![bend(100.0, 0.0, 0.7), bend(length_mm, rotation_rad, 0.5)]);
+        model.lra.bends[1].radius_mm = radius_mm;
+        is_one(&model, 1)
+    };
+    assert!(with(0.4, 0.009, 40.5));
+    assert!(!with(0.6, 0.0, 40.0), "a straight of 0.05 radii and more");
+    assert!(!with(0.0, 0.011, 40.0), "a turn");
+    assert!(!with(0.0, 0.0, 41.0), "another CLR");
 }
