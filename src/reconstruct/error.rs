@@ -72,6 +72,15 @@ pub enum ReconstructError {
         /// Standard deviation that the angle would have.
         sigma_deg: f64,
     },
+    /// No straight was seen behind the first or the last bend: how far it turns in all is not known.
+    #[error(
+        "the scan stops within bend {bend}, or what goes on behind it was not recognised: its angle is not known; scan \
+        past it to the end of the tube, clear of what holds it there"
+    )]
+    EndsInBend {
+        /// Bend counted from 1, in the scan's order.
+        bend: usize,
+    },
     /// The fitted tube does not explain the points.
     #[error(
         "only {used} of {points} points lie on the tube found (radius {radius_mm:.2} mm, {bends} bends); clear the scene or scan again"

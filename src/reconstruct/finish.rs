@@ -103,12 +103,23 @@ fn finish_as_chosen(
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
     }
+    if let Some(bend) = ends_in_bend(&best.model) {
+        return Err(ReconstructError::EndsInBend { bend });
+    }
     measured.residual_median_mm = best.median_mm;
     measured.decisions.clone_from(&chosen.decisions);
     measured.points_total = cloud.len();
     measured.warnings.splice(0..0, scene.warnings.iter().cloned());
     let TubeModel { lra, ovality_mm, .. } = best.model.clone();
     Ok(Reconstruction { measured, spine: best.model.spine(), lra, ovality_mm })
+}
+
+/// The bend, counted from 1, behind which the points show no straight.
+fn ends_in_bend(model: &TubeModel) -> Option<usize> {
+    let bends = &model.lra.bends;
+    let first = bends.first()?.length_mm < 0.0;
+    let last = model.lra.last_length_mm < 0.0;
+    if first { Some(1) } else { last.then_some(bends.len()) }
 }
 
 /// The sample's fit taken to all points.
