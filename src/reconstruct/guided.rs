@@ -20,7 +20,7 @@ use super::profile::lengths;
 use super::search::{DOUBT, JOINT_GAIN};
 use super::sections::CentreLine;
 use super::structure::{self, Shown, Structure};
-use crate::tube::{Lra, Nominal};
+use crate::tube::{Decision, Lra, Nominal};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
@@ -49,6 +49,10 @@ const MAX_ANGLE_SIGMA_RAD: f64 = 5.0 * DEGREE;
 /// Two answers that differ by less than this and the sigmas are the same.
 const SAME_ANGLE_RAD: f64 = 0.05 * DEGREE;
 
+/// What is told of the nominal's structure beside the scan's own.
+const KEPT: &str = "the scan's own explains it no better";
+const LEFT: &str = "the scan's own explains it better";
+
 /// A structure and what the user should know of the choice, bends counted as the nominal counts them.
 pub type Chosen = (Structure, Vec<String>);
 
@@ -58,16 +62,23 @@ pub fn choose(shown: &Shown, nominal: &Nominal) -> Option<Chosen> {
     let free = || structure::choose(shown);
     let part = nominal.lra.merged();
     let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
-        return free().map(|s| (s, Vec::new()));
+        return free().map(|own| (told(own, "it cannot lie on the centre line", 0.0, false), Vec::new()));
     };
+    let taken = |why: &str| told(guided.structure(), why, 0.0, true);
     if guided.is_sure(polygon) {
-        let notes = guided.resting();
-        return Some((guided.structure(), notes));
+        return Some((taken("nothing in the scan speaks against it"), guided.resting()));
     }
     match free() {
         Some(own) => Some(guided.or_own(own, sample)),
-        None => guided.explains(polygon).then(|| (guided.structure(), Vec::new())),
+        None => guided.explains(polygon).then(|| (taken("the scan by itself shows none"), Vec::new())),
     }
+}
+
+/// The structure with what became of the nominal's among its decisions; `gain` over the scan's own.
+fn told(mut structure: Structure, why: &str, gain: f64, kept: bool) -> Structure {
+    let what = format!("the nominal's structure: {why}");
+    structure.decisions.push(Decision { what, bend: None, gain, kept });
+    structure
 }
 
 /// A fit to the sections.
@@ -267,17 +278,21 @@ impl Guided {
         // The nominal's, but for what its further bends cost no worse: the free search spared itself the shallow ones.
         let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
         let spared = formed && mine.score - saved <= other.score;
+        let gain = other.score - mine.score;
+        let mine_is_kept = || (told(self.structure(), KEPT, gain, true), self.resting());
         if sure && (mine.score <= other.score || spared) {
-            return (self.structure(), self.resting());
+            return mine_is_kept();
         }
         let groups = self.groups(&other.model);
         if bends == n && groups.is_empty() {
-            let guided = if sure { self.structure() } else { own };
-            return (guided, self.resting());
+            return if sure { mine_is_kept() } else { (told(own, LEFT, gain, false), self.resting()) };
         }
         let what = if bends == 1 { "bend" } else { "bends" };
         let list = if groups.is_empty() { String::new() } else { format!("; {}", groups.join("; ")) };
-        (own, vec![format!("the scan by itself shows {bends} {what}, the nominal has {n}{list}")])
+        (
+            told(own, LEFT, gain, false),
+            vec![format!("the scan by itself shows {bends} {what}, the nominal has {n}{list}")],
+        )
     }
 
     /// Bend by bend of the nominal where the other model has other angles there, both in figures.

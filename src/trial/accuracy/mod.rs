@@ -3,11 +3,15 @@
 //!
 //! ```text
 //! judge     one scan: every value's error, reported sigma and bound; right, silently wrong, refused
+//! nominal   the part as drawn, and wrong ones
+//! guidance  what knowing the nominal did
 //! tally     many scans: medians and extremes, error over bound, coverage of the sigmas, targets
 //! text      rows and tables
 //! ```
 
+mod guidance;
 mod judge;
+mod nominal;
 mod tally;
 mod text;
 
@@ -15,7 +19,7 @@ mod text;
 mod tests;
 
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Instant;
 
@@ -23,10 +27,13 @@ use super::TrialError;
 use crate::cloud::{PointCloud, Unit, read_scan};
 use crate::reconstruct::{Options, Reconstruction, reconstruct};
 use crate::sim::population::{Scene, papers_tube, random_scene, random_tube};
-use crate::sim::scan::{ScanSettings, TubeShape, UnseenEnd, scan};
+use crate::sim::scan::{ScanSettings, SimulatedScan, TubeShape, UnseenEnd, scan};
 use crate::sim::scan_file::ScanFile;
+use crate::tube::Nominal;
 
+pub use guidance::{Answer, Guidance, Taken};
 pub use judge::{Judgement, Kind, Value, Verdict, judge, refused};
+pub use nominal::{Drawn, Wrong, drawn};
 pub use tally::{Coverage, Errors, Tally, coverage, errors, rms_over_bound};
 pub use text::{heading, markdown, row, totals};
 
@@ -114,10 +121,21 @@ pub struct Case {
     pub elapsed_ms: f64,
     /// What became of it.
     pub judgement: Judgement,
+    /// What knowing the nominal did, where one was given.
+    pub guidance: Option<Guidance>,
+}
+
+/// What is known beforehand of each case.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Known {
+    /// Nothing.
+    Nothing,
+    /// Its nominal; wrong ones are tried besides.
+    Nominal,
 }
 
 /// Simulates and reconstructs one case. `folder` takes its scan file while the case lasts, where the set writes files.
-pub fn run(set: Set, seed: u64, folder: &Path) -> Result<Case, TrialError> {
+pub fn run(set: Set, seed: u64, known: Known, folder: &Path) -> Result<Case, TrialError> {
     let Scene { tube, file } = match set {
         Set::Thirty => Scene { tube: random_tube(seed), file: None },
         Set::Hard => random_scene(seed),
@@ -125,19 +143,20 @@ pub fn run(set: Set, seed: u64, folder: &Path) -> Result<Case, TrialError> {
     };
     let (shape, settings) = (&tube.shape, &tube.settings);
     let scanned = scan(shape, settings, seed);
-    let (found, elapsed_ms) = match file {
-        Some(file) => {
-            let path = folder.join("scan").with_extension(file.extension());
-            file.write(&path, &scanned.points)?;
-            let timed = timed(|| measure_file(&path));
-            std::fs::remove_file(&path)?;
-            timed
-        }
-        None => {
-            let cloud = scanned.cloud();
-            timed(|| measure(&cloud))
-        }
-    };
+    let shown = Shown::new(&scanned, file, folder)?;
+    let drawn = (known == Known::Nominal).then(|| drawn(shape, seed));
+    let started = Instant::now();
+    let found = shown.measure(drawn.as_ref().map(|d| &d.nominal));
+    let elapsed_ms = started.elapsed().as_secs_f64() * 1e3;
+    let guidance = drawn.map(|d| {
+        let wrong = |w: Wrong| {
+            let found = shown.measure(Some(&w.of(&d.nominal, seed)?));
+            Some((w, guidance::answer(found.as_ref(), w)))
+        };
+        let wrong = Wrong::ALL.into_iter().filter_map(wrong).collect();
+        Guidance { wrong, ..Guidance::of(found.as_ref(), &d, &scanned.spine) }
+    });
+    shown.remove()?;
     let judgement = match found {
         Ok(found) => judge(&found, shape, settings, &scanned),
         Err(reason) => refused(reason),
@@ -151,22 +170,41 @@ pub fn run(set: Set, seed: u64, folder: &Path) -> Result<Case, TrialError> {
         nuisances: nuisances(shape, settings, file),
         elapsed_ms,
         judgement,
+        guidance,
     })
 }
 
-fn timed<T>(work: impl FnOnce() -> T) -> (T, f64) {
-    let started = Instant::now();
-    let result = work();
-    (result, started.elapsed().as_secs_f64() * 1e3)
+/// A scan as the reconstruction gets it.
+enum Shown {
+    Cloud(PointCloud),
+    File(PathBuf),
 }
 
-fn measure_file(path: &Path) -> Result<Reconstruction, String> {
-    let scan = read_scan(path, Unit::Millimetre).map_err(|e| e.to_string())?;
-    measure(&scan.cloud)
-}
+impl Shown {
+    fn new(scanned: &SimulatedScan, file: Option<ScanFile>, folder: &Path) -> Result<Shown, TrialError> {
+        let Some(file) = file else { return Ok(Shown::Cloud(scanned.cloud())) };
+        let path = folder.join("scan").with_extension(file.extension());
+        file.write(&path, &scanned.points)?;
+        Ok(Shown::File(path))
+    }
 
-fn measure(cloud: &PointCloud) -> Result<Reconstruction, String> {
-    reconstruct(cloud, &Options::default()).map_err(|e| e.to_string())
+    fn measure(&self, nominal: Option<&Nominal>) -> Result<Reconstruction, String> {
+        let measure =
+            |cloud: &PointCloud| reconstruct(cloud, &Options { nominal }).map_err(|e| e.to_string());
+        match self {
+            Shown::Cloud(cloud) => measure(cloud),
+            Shown::File(path) => {
+                measure(&read_scan(path, Unit::Millimetre).map_err(|e| e.to_string())?.cloud)
+            }
+        }
+    }
+
+    fn remove(self) -> std::io::Result<()> {
+        match self {
+            Shown::Cloud(_) => Ok(()),
+            Shown::File(path) => std::fs::remove_file(path),
+        }
+    }
 }
 
 /// What spoils a scan, in a few words.

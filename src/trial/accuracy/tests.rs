@@ -40,7 +40,7 @@ fn silently_wrong_is_far_off_and_said_to_be_certain() {
 #[test]
 fn a_measurement_is_judged_in_the_direction_that_fits() {
     let folder = std::env::temp_dir();
-    let case = run(Set::Paper, 0, &folder).unwrap();
+    let case = run(Set::Paper, 0, Known::Nothing, &folder).unwrap();
     assert_eq!(case.judgement.verdict, Verdict::Right);
     let count = |kind| case.judgement.values.iter().filter(|v| v.kind == kind).count();
     assert_eq!(Kind::ALL.map(count), [5, 4, 4, 2, 4, 2, 5, 1]);
@@ -63,6 +63,7 @@ fn targets_are_missed_by_the_case() {
         nuisances: String::new(),
         elapsed_ms: 1.0,
         judgement: Judgement { verdict, values: vec![value(Kind::Angle, 0.1, 0.1)] },
+        guidance: None,
     };
     let mut tally = Tally { cases: (0..30).map(|_| case(Verdict::Right)).collect() };
     assert_eq!(tally.misses(Set::Thirty), Vec::<String>::new());
@@ -95,7 +96,7 @@ fn an_end_that_was_not_scanned_is_not_asked_for() {
 
 #[test]
 fn the_table_says_what_it_is_of() {
-    let case = run(Set::Paper, 4, Path::new(".")).unwrap();
+    let case = run(Set::Paper, 4, Known::Nothing, Path::new(".")).unwrap();
     let table = markdown(&Tally { cases: vec![case] }, Set::Paper);
     assert!(table.starts_with("Set `paper`, seeds 4 to 4: 1 right of 1;"), "{table}");
     assert_eq!(table.lines().filter(|l| l.starts_with('|')).count(), 2 + Kind::ALL.len());

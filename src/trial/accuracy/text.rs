@@ -1,5 +1,6 @@
 //! The accuracy run as text: a row per case, totals as a plain or a markdown table.
 
+use super::guidance::{guidance, remark as guidance_remark};
 use super::{Case, Coverage, Kind, Set, Tally, Value, Verdict, coverage, errors, rms_over_bound};
 
 /// Kinds whose largest error and error over bound stand in a case's row.
@@ -32,8 +33,9 @@ pub fn row(case: &Case) -> String {
     let cells = if values.is_empty() { String::new() } else { IN_ROW.iter().map(cell).collect() };
     let Case { seed, tube_radius_mm, bends, points, elapsed_ms, nuisances, .. } = case;
     format!(
-        "{seed:>5} {tube_radius_mm:>7.2} {bends:>5} {points:>8} {elapsed_ms:>7.0}  {cells}  {nuisances}{}",
-        remark(case)
+        "{seed:>5} {tube_radius_mm:>7.2} {bends:>5} {points:>8} {elapsed_ms:>7.0}  {cells}  {nuisances}{}{}",
+        remark(case),
+        guidance_remark(case)
     )
 }
 
@@ -115,6 +117,7 @@ pub fn totals(tally: &Tally, set: Set) -> String {
     let mut out = line(COLUMNS.map(str::to_owned));
     Kind::ALL.iter().for_each(|k| out += &line(cells(tally, *k)));
     out += &format!("{}; median {:.0} ms a case\n", summary(tally), tally.median_ms());
+    out += &guidance(tally);
     let misses = tally.misses(set);
     match misses.is_empty() {
         true => out + "targets met",
@@ -130,5 +133,9 @@ pub fn markdown(tally: &Tally, set: Set) -> String {
     let mut out = format!("Set `{}`, seeds {first} to {last}: {}.\n\n", set.name(), summary(tally));
     out += &(line(COLUMNS.map(str::to_owned)) + "|:--" + &"|--:".repeat(10) + "|\n");
     Kind::ALL.iter().for_each(|k| out += &line(cells(tally, *k)));
+    let guidance = guidance(tally);
+    if !guidance.is_empty() {
+        out += &format!("\n{guidance}");
+    }
     out.trim_end().to_owned()
 }
