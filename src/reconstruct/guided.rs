@@ -2,24 +2,26 @@
 //! the measured centre line, and doubted. Beside [`structure`], the free search, which is the check on it.
 //!
 //! Safety: a wrong part must never look like a good measurement of the right one. So the nominal's structure is returned
-//! only (1) when the fit raises no doubt: all of the centre line lies on it, no joint anywhere would explain the sections
-//! better (the free search's own test), and every angle, rotation and length is what forming may have made of the
+//! only (1) when the fit raises no doubt: all of the centre line lies on it, no bend more would explain the sections better
+//! (tried where the free search would), and every angle, rotation, length and CLR is what forming may have made of the
 //! nominal's; or (2) in doubt, when the free search finds nothing that explains the sections better. Where the free
 //! search explains them better, its answer is returned, with both in figures. Bends too shallow for the free search are
 //! kept: they cost it more than they explain, which is no evidence against them.
 
-use nalgebra::Point3;
+use nalgebra::{DMatrix, Point3, UnitQuaternion, Vector3};
 
-use super::evidence::Solved;
+use super::evidence::{Joint, Solved};
 use super::fit::{RadiusPrior, Way, descend};
-use super::likeness::{is_formed, rows};
+use super::likeness::{is_formed, rows, unlikeness};
 use super::model::{Parameter, TubeModel};
-use super::moves::{with_common_radius, without_bend};
+use super::moves::{split, with_bend, with_common_radius, without_bend};
 use super::places::{Course, SHALLOW_RAD, lay};
-use super::profile::lengths;
+use super::profile::{Held, lengths};
 use super::search::{DOUBT, JOINT_GAIN};
 use super::sections::CentreLine;
+use super::stripes;
 use super::structure::{self, Shown, Structure};
+use super::whole::Whole;
 use crate::tube::{Decision, Lra, Nominal};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
@@ -37,8 +39,20 @@ const RADIUS_SPREAD: f64 = 0.3;
 const OFF_RADII: f64 = 0.25;
 const MOST_OFF: usize = 3;
 
+/// A bend of less than this share of its nominal angle may have been lost by the fit: at no angle a plane says nothing.
+const LOST_SHARE: f64 = 0.2;
+
 /// Sections that scatter this much more than their points say are not the tube's.
 const MOST_CORRELATION: f64 = 25.0;
+
+/// A joint worth so many times what makes it looked at is more than one bend's.
+const MOST_GAIN: f64 = 10.0;
+
+/// A bend that moves the tube by less than so many times what the passes lie apart is their doing (as in `search`).
+const ABOVE_PASSES: f64 = 2.75;
+
+/// Forming and the die's wear change a CLR by less than this share of it.
+const DIE_SHARE: f64 = 0.2;
 
 /// Answers that differ by fewer of these are the same.
 const SIGMAS: f64 = 4.0;
@@ -65,7 +79,7 @@ pub fn choose(shown: &Shown, nominal: &Nominal) -> Option<Chosen> {
         return free().map(|own| (told(own, "it cannot lie on the centre line", 0.0, false), Vec::new()));
     };
     let taken = |why: &str| told(guided.structure(), why, 0.0, true);
-    if guided.is_sure(polygon) {
+    if guided.is_sure(polygon, &shown.whole) {
         return Some((taken("nothing in the scan speaks against it"), guided.resting()));
     }
     match free() {
@@ -103,6 +117,8 @@ struct Guided {
     reversed: bool,
     /// Standard deviation per parameter.
     sigmas: Vec<f64>,
+    /// Lengths that the linear equations leave open.
+    held: Vec<Held>,
     solved: Solved,
 }
 
@@ -137,6 +153,33 @@ fn expected_radii(part: &Lra) -> Option<RadiusPrior> {
     (weight > 0.0).then_some(RadiusPrior { radius_mm: mean, spread_mm: most })
 }
 
+/// The covariance when a value is as sure as was found by moving it.
+fn hold(covariance: &mut DMatrix<f64>, parameters: &[Parameter], (parameter, sigma): &Held) {
+    let Some(j) = parameters.iter().position(|p| p == parameter) else { return };
+    let (own, wanted) = (covariance[(j, j)], sigma * sigma);
+    if own > wanted {
+        let column = covariance.column(j).into_owned();
+        *covariance -= &column * column.transpose() * ((own - wanted) / (own * own));
+    }
+}
+
+/// The model with a bend that the fit has lost turned as the nominal has it; the bends after it stay in their planes.
+fn bent_again(model: &TubeModel, part: &Lra, i: usize) -> TubeModel {
+    let mut out = model.clone();
+    let bends = &mut out.lra.bends;
+    bends[i].angle_rad = part.bends[i].angle_rad;
+    if i > 0 {
+        let turn = bends[i].rotation_rad - part.bends[i].rotation_rad;
+        bends[i].rotation_rad -= turn;
+        bends.iter_mut().skip(i + 1).take(1).for_each(|b| b.rotation_rad += turn);
+    } else if let Some(next) = bends.get_mut(1) {
+        let turn = next.rotation_rad - part.bends[1].rotation_rad;
+        next.rotation_rad -= turn;
+        out.start *= UnitQuaternion::from_axis_angle(&Vector3::x_axis(), turn);
+    }
+    out
+}
+
 fn has_common_radius(part: &Lra) -> bool {
     part.bends.windows(2).all(|w| (w[0].radius_mm - w[1].radius_mm).abs() < 1e-6)
 }
@@ -152,11 +195,22 @@ impl Guided {
                 let start = lay(&course, &part)?;
                 Some((fitted(&rough, start, prior, 1.0, ROUGH_STEPS), part, reversed))
             });
-        let (mut best, part, reversed) = laid.min_by(|a, b| a.0.score.total_cmp(&b.0.score))?;
+        // Where it fits as well both ways, the more alike.
+        let off = |(found, part, _): &(Fitted, Lra, bool)| {
+            found.score + unlikeness(&rows(&found.model.lra), &rows(part), radius_mm)
+        };
+        let (mut best, part, reversed) = laid.min_by(|a, b| off(a).total_cmp(&off(b)))?;
         let mut line = rough;
         for round in 0..MEASUREMENTS {
             line = CentreLine::measure(sample, &best.model, round > 0);
             best = fitted(&line, best.model, prior, 1.0, FULL_STEPS);
+            for i in 0..part.bends.len() {
+                if best.model.lra.bends[i].angle_rad < LOST_SHARE * part.bends[i].angle_rad {
+                    let again = bent_again(&best.model, &part, i);
+                    let again = fitted(&line, again, prior, 1.0, FULL_STEPS);
+                    best = if again.score < best.score { again } else { best };
+                }
+            }
         }
         let correlation = line.correlation(&best.model);
         best = fitted(&line, best.model, prior, correlation, 0);
@@ -166,14 +220,16 @@ impl Guided {
         }
         let solved = Solved::new(&line, &best.model, &best.parameters, None);
         let variance = line.noise_mm.powi(2) * correlation;
-        let sigmas = solved.inverse.diagonal().iter().map(|v| (v * variance).max(0.0).sqrt()).collect();
-        Some(Guided { best, line, correlation, prior, part, reversed, sigmas, solved })
+        let held = lengths(&line, &best.model, correlation, prior);
+        let mut covariance = &solved.inverse * variance;
+        held.iter().for_each(|h| hold(&mut covariance, &best.parameters, h));
+        let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
+        Some(Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved })
     }
 
     fn structure(&self) -> Structure {
         let (model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
-        let held = lengths(&self.line, &model, self.correlation, self.prior);
-        Structure { model, noise_mm, prior: self.prior, held, decisions: Vec::new() }
+        Structure { model, noise_mm, prior: self.prior, held: self.held.clone(), decisions: Vec::new() }
     }
 
     fn sigma(&self, parameter: Parameter) -> Option<f64> {
@@ -220,12 +276,13 @@ impl Guided {
     }
 
     /// Whether nothing speaks for asking the free search.
-    fn is_sure(&self, polygon: &[Point3<f64>]) -> bool {
+    fn is_sure(&self, polygon: &[Point3<f64>], whole: &Whole) -> bool {
         self.correlation <= MOST_CORRELATION
             && self.is_determined()
             && self.is_formed_of_the_nominal()
             && self.explains(polygon)
-            && !self.lacks_a_joint()
+            && self.is_of_its_dies()
+            && !self.lacks_a_bend(whole)
     }
 
     /// Whether every angle is measured.
@@ -233,11 +290,44 @@ impl Guided {
         (0..self.part.bends.len()).all(|i| self.angle_sigma_rad(i) <= MAX_ANGLE_SIGMA_RAD)
     }
 
-    /// Whether the free search would try a bend somewhere.
-    fn lacks_a_joint(&self) -> bool {
-        let joints =
-            self.solved.joints(&self.line, &self.best.model, &self.best.parameters, self.line.noise_mm);
-        joints.iter().any(|j| j.gain > JOINT_GAIN * self.correlation)
+    /// Whether a bend more would explain the scan better, or what the residuals say is too much for one: tried where the
+    /// free search would try one.
+    fn lacks_a_bend(&self, whole: &Whole) -> bool {
+        let (model, line) = (&self.best.model, &self.line);
+        let mut joints = self.solved.joints(line, model, &self.best.parameters, line.noise_mm);
+        let gain = JOINT_GAIN * self.correlation;
+        joints.retain(|j| j.gain > gain);
+        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        let Some(first) = joints.first() else { return false };
+        if first.gain > MOST_GAIN * gain {
+            return true;
+        }
+        let mut tried: Vec<&Joint> = Vec::new();
+        for joint in &joints {
+            let near = |other: &&Joint| (other.at_mm - joint.at_mm).abs() < 2.0 * model.tube_radius_mm;
+            if !tried.iter().any(near) {
+                tried.push(joint);
+            }
+        }
+        // Its place is the best of many.
+        let place = 2.0 * (line.places() as f64).ln();
+        let more = tried.iter().flat_map(|j| [with_bend(model, j), split(model, j)].concat());
+        let fitted = more.map(|m| fitted(line, m, self.prior, self.correlation, FULL_STEPS));
+        let mut better = fitted.filter(|f| f.score + place < self.best.score).peekable();
+        if better.peek().is_none() {
+            return false;
+        }
+        let passes_mm = stripes::disagreement_mm(whole, model, line.noise_mm);
+        better.any(|f| line.apart_mm(model, &f.model) > ABOVE_PASSES * passes_mm)
+    }
+
+    /// Whether every CLR is about the nominal's: a bend much wider may be two.
+    fn is_of_its_dies(&self) -> bool {
+        let pairs = self.best.model.lra.bends.iter().zip(&self.part.bends).enumerate();
+        pairs.into_iter().all(|(i, (found, part))| {
+            let sigma_mm = self.sigma(Parameter::BendRadius(i)).unwrap_or(0.0);
+            (found.radius_mm - part.radius_mm).abs() < DIE_SHARE * part.radius_mm + SIGMAS * sigma_mm
+        })
     }
 
     /// Bends that the free search would not spend their values on.

@@ -171,6 +171,13 @@ pub fn doubts(found: &[Row], part: &Lra, tube_radius_mm: f64) -> Vec<String> {
                     .collect();
             }
         }
+        let hand = part.mirrored();
+        let ways = [rows(&hand), rows(&hand.reversed())].map(|rows| fewer(&rows, m - n)).concat();
+        if ways.iter().any(|(_, rest)| formed(found, rest)) {
+            let text = "looks like the mirror image: the bends found are as the nominal's other hand has them; check program \
+                        and loading";
+            return vec![text.to_owned()];
+        }
     }
     if n > m && n - m <= MOST_AMISS {
         for (rows, _) in &both {

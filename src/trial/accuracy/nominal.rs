@@ -23,10 +23,10 @@ const LEAST_ANGLE_DEG: f64 = 0.1;
 /// A tube whose straights all point less than this out of one plane is its own mirror image.
 const FLAT_DEG: f64 = 10.0;
 
-/// The bend that a nominal has and the tube lacks: its angle, and how much of the straight it may take.
+/// The bend that a nominal has and the tube lacks: its angle; a straight of a diameter is left on either side, or it might
+/// be its neighbour's.
 const ADDED_DEG: std::ops::Range<f64> = 20.0..90.0;
 const LEAST_ADDED_DEG: f64 = 10.0;
-const MOST_TAKEN: f64 = 0.8;
 
 /// A part as drawn, and whether it is drawn from the other end than the simulated tube.
 #[derive(Debug, Clone)]
@@ -79,7 +79,7 @@ impl Wrong {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
         let lra = match self {
             Wrong::Mirrored => is_handed(&right.lra).then(|| right.lra.mirrored()),
-            Wrong::BendMissing => with_a_bend(&right.lra, &mut rng),
+            Wrong::BendMissing => with_a_bend(right, &mut rng),
             Wrong::BendTooMany => without_a_bend(&right.lra, &mut rng),
             Wrong::OtherPart => Some(another(right.od_mm, seed + 1)),
         };
@@ -135,19 +135,20 @@ fn is_handed(lra: &Lra) -> bool {
 }
 
 /// With one bend more in its longest inner straight, or last one; None where that is too short for a bend.
-fn with_a_bend(lra: &Lra, rng: &mut ChaCha8Rng) -> Option<Lra> {
+fn with_a_bend(part: &Nominal, rng: &mut ChaCha8Rng) -> Option<Lra> {
+    let lra = &part.lra;
     let n = lra.bends.len();
     let inner = (1..n).max_by(|a, b| lra.bends[*a].length_mm.total_cmp(&lra.bends[*b].length_mm));
     let at = inner.unwrap_or(n);
     let straight_mm = lra.bends.get(at).map_or(lra.last_length_mm, |b| b.length_mm);
     let radius_mm = lra.bends.first()?.radius_mm;
-    let most_rad = MOST_TAKEN * straight_mm / radius_mm;
+    let most_rad = (straight_mm - 2.0 * part.od_mm) / radius_mm;
     let angle_rad = rng.random_range(ADDED_DEG).to_radians().min(most_rad);
     if angle_rad < LEAST_ADDED_DEG.to_radians() {
         return None;
     }
     let rest_mm = straight_mm - radius_mm * angle_rad;
-    let length_mm = rng.random_range(0.2..0.8) * rest_mm;
+    let length_mm = part.od_mm + rng.random_range(0.0..1.0) * (rest_mm - 2.0 * part.od_mm);
     let rotation_rad = rng.random_range(-3.0..3.0);
     let mut out = lra.clone();
     match out.bends.get_mut(at) {
