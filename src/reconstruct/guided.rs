@@ -42,8 +42,13 @@ const MOST_OFF: usize = 3;
 /// A bend of less than this share of its nominal angle may have been lost by the fit: at no angle a plane says nothing.
 const LOST_SHARE: f64 = 0.2;
 
-/// Sections that scatter this much more than their points say are not the tube's.
+/// Sections that scatter this much more than their points say are not the tube's, unless the passes disagree: then by so
+/// many times what one point of each section would say of the passes.
 const MOST_CORRELATION: f64 = 25.0;
+const PASSES_CORRELATION: f64 = 5.0;
+
+/// A joint that takes away such a share of all misfit is tried whatever the scatter (as in `search`).
+const EXPLAINED: f64 = 0.2;
 
 /// A joint worth so many times what makes it looked at is more than one bend's.
 const MOST_GAIN: f64 = 10.0;
@@ -277,12 +282,13 @@ impl Guided {
 
     /// Whether nothing speaks for asking the free search.
     fn is_sure(&self, polygon: &[Point3<f64>], whole: &Whole) -> bool {
-        self.correlation <= MOST_CORRELATION
+        let passes_mm = stripes::disagreement_mm(whole, &self.best.model, self.line.noise_mm);
+        !self.is_scattered(passes_mm)
             && self.is_determined()
             && self.is_formed_of_the_nominal()
             && self.explains(polygon)
             && self.is_of_its_dies()
-            && !self.lacks_a_bend(whole)
+            && !self.lacks_a_bend(passes_mm)
     }
 
     /// Whether every angle is measured.
@@ -290,16 +296,24 @@ impl Guided {
         (0..self.part.bends.len()).all(|i| self.angle_sigma_rad(i) <= MAX_ANGLE_SIGMA_RAD)
     }
 
+    /// Whether the sections scatter more about the tube than their points, and what the passes disagree, say.
+    fn is_scattered(&self, passes_mm: f64) -> bool {
+        let each = self.line.count / (self.line.places() as f64).max(1.0);
+        let passes = each * (passes_mm / self.line.noise_mm).powi(2);
+        self.correlation > MOST_CORRELATION.max(PASSES_CORRELATION * passes)
+    }
+
     /// Whether a bend more would explain the scan better, or what the residuals say is too much for one: tried where the
-    /// free search would try one.
-    fn lacks_a_bend(&self, whole: &Whole) -> bool {
+    /// free search would try one, and judged by what it leaves.
+    fn lacks_a_bend(&self, passes_mm: f64) -> bool {
         let (model, line) = (&self.best.model, &self.line);
         let mut joints = self.solved.joints(line, model, &self.best.parameters, line.noise_mm);
         let gain = JOINT_GAIN * self.correlation;
-        joints.retain(|j| j.gain > gain);
+        let price = self.best.parameters.len() as f64 * (line.count / self.correlation).max(2.0).ln();
+        let misfit = (self.best.score - price) * self.correlation;
+        joints.retain(|j| j.gain > gain.min(EXPLAINED * misfit));
         joints.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-        let Some(first) = joints.first() else { return false };
-        if first.gain > MOST_GAIN * gain {
+        if joints.first().is_some_and(|j| j.gain > MOST_GAIN * gain) {
             return true;
         }
         let mut tried: Vec<&Joint> = Vec::new();
@@ -309,16 +323,16 @@ impl Guided {
                 tried.push(joint);
             }
         }
+        let more = tried.iter().flat_map(|j| [with_bend(model, j), split(model, j)].concat());
         // Its place is the best of many.
         let place = 2.0 * (line.places() as f64).ln();
-        let more = tried.iter().flat_map(|j| [with_bend(model, j), split(model, j)].concat());
-        let fitted = more.map(|m| fitted(line, m, self.prior, self.correlation, FULL_STEPS));
-        let mut better = fitted.filter(|f| f.score + place < self.best.score).peekable();
-        if better.peek().is_none() {
-            return false;
-        }
-        let passes_mm = stripes::disagreement_mm(whole, model, line.noise_mm);
-        better.any(|f| line.apart_mm(model, &f.model) > ABOVE_PASSES * passes_mm)
+        let is_better = |more: TubeModel| {
+            let more = fitted(line, more, self.prior, self.correlation, FULL_STEPS).model;
+            let correlation = line.correlation(&more).min(self.correlation);
+            let judged = |m: &TubeModel| fitted(line, m.clone(), self.prior, correlation, 0).score;
+            judged(&more) + place < judged(model) && line.apart_mm(model, &more) > ABOVE_PASSES * passes_mm
+        };
+        more.into_iter().any(is_better)
     }
 
     /// Whether every CLR is about the nominal's: a bend much wider may be two.
