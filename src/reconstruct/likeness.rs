@@ -15,6 +15,10 @@ const LENGTH_MM: f64 = 5.0;
 const LENGTH_RADII: f64 = 1.0;
 const SIGMAS: f64 = 4.0;
 
+/// So much more alike the mirror image must be where forming may have made the tube of either: rotations off by 0.7 of what
+/// forming may change.
+const CLEARLY: f64 = 0.5;
+
 /// A bend of less than this share of its nominal angle was not bent.
 const NOT_BENT_SHARE: f64 = 0.2;
 
@@ -144,15 +148,20 @@ pub fn doubts(found: &[Row], part: &Lra, tube_radius_mm: f64) -> Vec<String> {
     let wanted = rows(part);
     let formed = |found: &[Row], part: &[Row]| is_formed(found, part, tube_radius_mm);
     let missing: Vec<String> = found.iter().zip(&wanted).enumerate().filter_map(not_bent).collect();
-    if formed(found, &wanted) {
-        return missing;
-    }
     let hand = part.mirrored();
-    if [hand.reversed(), hand].iter().any(|h| formed(found, &rows(h))) {
+    let hands = [rows(&hand.reversed()), rows(&hand)];
+    let is_formed = formed(found, &wanted);
+    // A tube that is nearly flat may be made of either hand.
+    let unlike = |part: &[Row]| unlikeness(found, part, tube_radius_mm);
+    let clearly = if is_formed { unlike(&wanted) - CLEARLY } else { f64::INFINITY };
+    if hands.iter().any(|h| formed(found, h) && unlike(h) < clearly) {
         return vec![
             "looks like the mirror image: every bend is as the nominal's other hand has it; check program and loading"
                 .to_owned(),
         ];
+    }
+    if is_formed {
+        return missing;
     }
     let both = [(wanted.clone(), false), (rows(&part.reversed()), true)];
     let (n, m) = (found.len(), wanted.len());
@@ -171,8 +180,7 @@ pub fn doubts(found: &[Row], part: &Lra, tube_radius_mm: f64) -> Vec<String> {
                     .collect();
             }
         }
-        let hand = part.mirrored();
-        let ways = [rows(&hand), rows(&hand.reversed())].map(|rows| fewer(&rows, m - n)).concat();
+        let ways = hands.map(|rows| fewer(&rows, m - n)).concat();
         if ways.iter().any(|(_, rest)| formed(found, rest)) {
             let text = "looks like the mirror image: the bends found are as the nominal's other hand has them; check program \
                         and loading";
