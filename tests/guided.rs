@@ -48,6 +48,12 @@ fn has(found: &Reconstruction, beginning: &str) -> bool {
     found.measured.warnings.iter().any(|w| w.starts_with(beginning))
 }
 
+/// What was decided on the nominal's structure.
+fn taken_for(found: &Reconstruction) -> &str {
+    let mut all = found.measured.decisions.iter().map(|d| d.what.as_str());
+    all.find(|what| what.starts_with("the nominal's structure")).unwrap()
+}
+
 /// No word of another part.
 fn is_the_part(found: &Reconstruction) -> bool {
     let doubts =
@@ -186,6 +192,53 @@ fn the_mirror_image_is_called_so() {
         let found = guided(&scan_of(&formed(&lra, 3), settings(), 3), &part);
         assert!(has(&found, "looks like the mirror image"), "{:?}", found.measured.warnings);
         assert_eq!(found.measured.bends.len(), 4);
+    }
+}
+
+/// Its two hands differ by no more than forming changes, row by row; but all rows together say which it is.
+#[test]
+fn the_mirror_image_of_a_nearly_flat_tube_is_called_so() {
+    let across_a_shallow_bend = vec![
+        bend(90.0, 0.0, 75.0),
+        bend(150.0, -130.0, 3.0),
+        bend(60.0, 180.0, 81.0),
+        bend(80.0, 180.0, 40.0),
+    ];
+    let hardly_turned = vec![bend(90.0, 0.0, 60.0), bend(70.0, 5.5, 45.0), bend(120.0, 175.0, 90.0)];
+    for bends in [across_a_shallow_bend, hardly_turned] {
+        let part = part(&Lra { bends, last_length_mm: 110.0 }, 20.0);
+        let found = guided(&scan_of(&formed(&part.lra, 3), settings(), 3), &part);
+        assert!(is_the_part(&found), "{:?}", found.measured.warnings);
+        let found = guided(&scan_of(&formed(&part.lra.mirrored(), 3), settings(), 3), &part);
+        assert!(has(&found, "looks like the mirror image"), "{:?}", found.measured.warnings);
+    }
+}
+
+/// Beside wide bends in its own plane a bend of 2.7 degrees was fitted the other way round and lost.
+#[test]
+fn a_shallow_bend_beside_wide_ones_is_not_lost() {
+    let tube = random_tube(70_000);
+    let cloud = scanned(&tube.shape.lra, &tube, 70_000);
+    let found = guided(&cloud, &part(&nominal_of(&tube, 1), tube.shape.od_mm));
+    assert!(is_the_part(&found), "{:?}", found.measured.warnings);
+    assert_eq!(found.measured.bends.len(), 5);
+    assert!(taken_for(&found).ends_with("nothing in the scan speaks against it"));
+}
+
+/// Read from its other end this tube fits its nominal as well; the table must not come out turned round.
+#[test]
+fn the_direction_is_the_one_more_alike() {
+    let mut lra = frame_tube().lra;
+    lra.bends.truncate(3);
+    for lra in [lra.clone(), lra.reversed()] {
+        for seed in 0..3 {
+            let scan = scan_of(&formed(&lra, seed), settings(), seed);
+            let found = guided(&scan, &part(&lra, 20.0));
+            assert!(is_the_part(&found), "{:?}", found.measured.warnings);
+            assert!(taken_for(&found).ends_with("nothing in the scan speaks against it"));
+            let pairs = found.measured.bends.iter().zip(&lra.bends);
+            assert!(pairs.into_iter().all(|(m, n)| (m.angle_rad / n.angle_rad - 0.95).abs() < 0.035));
+        }
     }
 }
 

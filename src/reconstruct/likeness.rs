@@ -15,6 +15,9 @@ const LENGTH_MM: f64 = 5.0;
 const LENGTH_RADII: f64 = 1.0;
 const SIGMAS: f64 = 4.0;
 
+/// From this angle on a bend knows its plane.
+const CLEAR_RAD: f64 = 8.0 * DEGREE;
+
 /// So much more alike the mirror image must be where forming may have made the tube of either: rotations off by 0.7 of what
 /// forming may change.
 const CLEARLY: f64 = 0.5;
@@ -93,9 +96,27 @@ fn off(found: &[Row], part: &[Row], i: usize, tube_radius_mm: f64) -> [f64; 3] {
             ROTATION_RAD / known,
             f.rotation_sigma_rad,
             p.rotation_sigma_rad,
-        ),
+        )
+        .max(off_across(found, part, i)),
         over(f.length_mm - p.length_mm, length, f.length_sigma_mm, p.length_sigma_mm),
     ]
+}
+
+/// How far the plane of row `i` is off against that of the last clear bend before it, over what forming and the sigmas
+/// allow: of shallow bends between them each knows its own plane badly, but what they turn together is known.
+fn off_across(found: &[Row], part: &[Row], i: usize) -> f64 {
+    let angle = |k: usize| found[k].angle_rad.min(part[k].angle_rad);
+    let Some(before) = (0..i).rev().find(|k| angle(*k) >= CLEAR_RAD) else { return 0.0 };
+    if angle(i) < CLEAR_RAD || before + 1 == i {
+        return 0.0;
+    }
+    let between = before + 1..=i;
+    let turned = |rows: &[Row]| rows[between.clone()].iter().map(|r| r.rotation_rad).sum::<f64>();
+    let sigmas = found[between.clone()].iter().map(|r| r.rotation_sigma_rad);
+    let sigma = sigmas.fold(f64::INFINITY, f64::min);
+    let swing: f64 = found[before + 1..i].iter().map(|r| r.angle_rad).sum();
+    let usual = ROTATION_RAD / angle(i).min(angle(before)).min(1.0) + swing;
+    wrap_angle(turned(found) - turned(part)).abs() / (usual + SIGMAS * sigma)
 }
 
 /// Whether forming may have made the one of the other.

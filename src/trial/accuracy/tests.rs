@@ -1,6 +1,7 @@
 //! The measuring measured: what is counted as what.
 
 use super::*;
+use crate::tube::Lra;
 
 fn value(kind: Kind, error: f64, sigma: f64) -> Value {
     Value { kind, row: 1, error: Some(error), sigma: Some(sigma), bound: Some(0.1) }
@@ -101,4 +102,44 @@ fn the_table_says_what_it_is_of() {
     assert!(table.starts_with("Set `paper`, seeds 4 to 4: 1 right of 1;"), "{table}");
     assert_eq!(table.lines().filter(|l| l.starts_with('|')).count(), 2 + Kind::ALL.len());
     assert!(Set::from_str("thirty") == Ok(Set::Thirty) && Set::from_str("soft").is_err());
+}
+
+#[test]
+fn wrong_nominals_are_wrong_in_what_they_say() {
+    let turned = |lra: &Lra| lra.bends.iter().map(|b| b.angle_rad).sum::<f64>();
+    for seed in 0..20 {
+        let shape = random_tube(seed).shape;
+        let (n, right) = (shape.lra.bends.len(), drawn(&shape, seed).nominal);
+        assert_eq!(right.lra.bends.len(), n);
+        assert!(
+            right.lra.validate().is_ok() && turned(&right.lra) > turned(&shape.lra) - 0.01 * n as f64,
+            "sprung back"
+        );
+        let bends = |wrong: Wrong| {
+            let lra = wrong.of(&right, seed)?.lra;
+            assert!(lra.validate().is_ok());
+            Some(lra.bends.len())
+        };
+        assert!(bends(Wrong::Mirrored).is_none_or(|b| b == n));
+        assert!(bends(Wrong::BendMissing).is_none_or(|b| b == n + 1));
+        assert_eq!(bends(Wrong::BendTooMany), (n > 1).then(|| n - 1));
+        assert_eq!(bends(Wrong::OtherPart), Some(random_tube(seed + 1).shape.lra.bends.len()));
+    }
+    let flat = random_tube(0).shape;
+    let mut lra = flat.lra.clone();
+    lra.bends.iter_mut().for_each(|b| b.rotation_rad = 0.0);
+    let flat = drawn(&TubeShape { lra, ..flat }, 0).nominal;
+    assert!(Wrong::Mirrored.of(&flat, 0).is_none(), "its own mirror image");
+}
+
+#[test]
+fn with_the_nominal_all_is_told() {
+    let case = run(Set::Paper, 2, Known::Nominal, &std::env::temp_dir()).unwrap();
+    let guidance = case.guidance.clone().unwrap();
+    assert_eq!((guidance.taken, guidance.against), (Some(Taken::Undoubted), false));
+    assert!(guidance.alarms.is_empty() && guidance.wrong.len() == Wrong::ALL.len());
+    assert!(guidance.wrong.iter().all(|(_, answer)| *answer == Answer::Recognised), "{guidance:?}");
+    let table = markdown(&Tally { cases: vec![case] }, Set::Paper);
+    assert!(table.contains("without asking the free search 1,"), "{table}");
+    assert!(table.ends_with("| another part | 1 | 1 | 0 | 0 | 0 |"), "{table}");
 }
