@@ -15,9 +15,10 @@ mod own;
 use nalgebra::{DMatrix, Point3, UnitQuaternion, Vector3};
 
 use super::evidence::Solved;
-use super::fit::{RadiusPrior, Way, descend};
+use super::fit::{CUTOFF_SIGMAS, Effort, RadiusPrior, Way, descend, fit, polish};
 use super::likeness::{rows, unlikeness};
 use super::model::{Parameter, TubeModel};
+use super::moments::Sample;
 use super::moves::with_common_radius;
 use super::places::{Course, lay};
 use super::profile::{Held, lengths};
@@ -25,10 +26,14 @@ use super::sections::CentreLine;
 use super::structure::{self, Shown, Structure};
 use crate::tube::{Decision, Lra, Nominal};
 
-/// Steps of the fits to the polygon and to the sections, and how often the sections are measured.
+/// Steps of the fits to the polygon, to the sections and to the points, and how often the sections are measured.
 const ROUGH_STEPS: usize = 20;
 const FULL_STEPS: usize = 40;
+const POINT_STEPS: usize = 100;
 const MEASUREMENTS: usize = 2;
+
+/// A cloud of so many times the sample's points is large: a walk through it costs more than a fit to the sample.
+const MANY_SAMPLES: usize = 10;
 
 /// Bend radii are expected within this share of each other, or as far as the nominal's differ.
 const RADIUS_SPREAD: f64 = 0.3;
@@ -50,12 +55,12 @@ pub fn choose(shown: &Shown, nominal: &Nominal) -> Option<Chosen> {
     let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
         return free().map(|own| (told(own, "it cannot lie on the centre line", 0.0, false), Vec::new()));
     };
-    let taken = |why: &str| told(guided.structure(), why, 0.0, true);
+    let taken = |why: &str| told(guided.structure(shown), why, 0.0, true);
     if guided.is_sure(polygon, &shown.whole) {
         return Some((taken("nothing in the scan speaks against it"), guided.resting()));
     }
     match free() {
-        Some(own) => Some(guided.or_own(own, sample)),
+        Some(own) => Some(guided.or_own(own, shown)),
         None => guided.explains(polygon).then(|| (taken("the scan by itself shows none"), Vec::new())),
     }
 }
@@ -194,8 +199,17 @@ impl Guided {
         Some(Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved })
     }
 
-    fn structure(&self) -> Structure {
-        let (model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
+    /// The structure; of a large cloud fitted to the sample's own points, from where the fit to all is a step or two.
+    fn structure(&self, shown: &Shown) -> Structure {
+        let (mut model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
+        if shown.whole.len() > MANY_SAMPLES * shown.sample.len() {
+            let own = shown.sample.iter().filter(|p| !self.line.is_crowded_at(p)).copied().collect();
+            let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
+            let effort = Effort { cutoff_mm, rounds: 0, steps: POINT_STEPS, prior: self.prior };
+            let mut sample = Sample::new(own, &model);
+            let polished = polish(&mut sample, &model, effort, &self.held);
+            model = polished.unwrap_or_else(|| fit(&mut sample, &model, effort)).model;
+        }
         Structure { model, noise_mm, prior: self.prior, held: self.held.clone(), decisions: Vec::new() }
     }
 

@@ -1,14 +1,12 @@
 //! The nominal's structure beside the scan's own, which was asked in doubt; and what the user is told of either.
 
-use nalgebra::Point3;
-
 use super::super::likeness::{is_formed, rows};
 use super::super::model::TubeModel;
 use super::super::moves::without_bend;
 use super::super::places::SHALLOW_RAD;
 use super::super::search::DOUBT;
 use super::super::sections::CentreLine;
-use super::super::structure::Structure;
+use super::super::structure::{Shown, Structure};
 use super::{Chosen, FULL_STEPS, Guided, SIGMAS, fitted, told};
 
 /// Two answers that differ by less than this and the sigmas are the same.
@@ -50,9 +48,9 @@ impl Guided {
     }
 
     /// The better of the nominal's structure and the scan's own.
-    pub(super) fn or_own(&self, own: Structure, sample: &[Point3<f64>]) -> Chosen {
+    pub(super) fn or_own(&self, own: Structure, shown: &Shown) -> Chosen {
         let n = self.part.bends.len();
-        let line = CentreLine::measure(sample, &own.model, true);
+        let line = CentreLine::measure(shown.sample, &own.model, true);
         let correlation = line.correlation(&own.model);
         let mine = fitted(&line, self.best.model.clone(), self.prior, correlation, FULL_STEPS);
         let other = fitted(&line, own.model.clone(), own.prior, correlation, 0);
@@ -63,7 +61,7 @@ impl Guided {
         let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
         let spared = formed && mine.score - saved <= other.score;
         let gain = other.score - mine.score;
-        let mine_is_kept = || (told(self.structure(), KEPT, gain, true), self.resting());
+        let mine_is_kept = || (told(self.structure(shown), KEPT, gain, true), self.resting());
         if sure && (mine.score <= other.score || spared) {
             return mine_is_kept();
         }
