@@ -11,7 +11,7 @@ use benderd::config::{Materials, load_part};
 use benderd::reconstruct::{Options, ReconstructError, reconstruct};
 use benderd::sim::population::{random_scene, random_tube};
 use benderd::sim::scan::{Density, ScanSettings, SimulatedScan, TubeShape, scan};
-use benderd::trial::accuracy::{Set, Verdict, run as run_case};
+use benderd::trial::accuracy::{Known, Set, Verdict, run as run_case};
 use benderd::tube::{Bend, Frame, Lra, MeasuredTube, Nominal, wrap_angle};
 use nalgebra::{Point3, Vector3};
 use tempfile::TempDir;
@@ -156,7 +156,7 @@ fn hard_scans_that_once_failed() {
 fn expect_right(set: Set, seeds: &[u64]) {
     let folder = TempDir::new().unwrap();
     for &seed in seeds {
-        let case = run_case(set, seed, folder.path()).unwrap();
+        let case = run_case(set, seed, Known::Nothing, folder.path()).unwrap();
         assert_eq!(case.judgement.verdict, Verdict::Right, "{} {seed}", set.name());
     }
 }
