@@ -120,10 +120,12 @@ pub fn reconstruct_watched(
     options: &Options,
     begins: &mut dyn FnMut(Stage),
 ) -> Result<Reconstruction, ReconstructError> {
-    use ReconstructError::{NotBent, PoorFit, Undetermined};
+    use ReconstructError::{EndsInBend, NotBent, PoorFit, Undetermined};
     match by(cloud, options, options.nominal, begins) {
         // Knowing the nominal never makes it worse.
-        Err(NotBent { .. } | PoorFit { .. } | Undetermined { .. }) if options.nominal.is_some() => {
+        Err(NotBent { .. } | PoorFit { .. } | Undetermined { .. } | EndsInBend { .. })
+            if options.nominal.is_some() =>
+        {
             by(cloud, options, None, begins)
         }
         found => found,
