@@ -93,6 +93,14 @@ pub fn likeliest_pairs(model: &TubeModel) -> Vec<usize> {
     pairs
 }
 
+/// Shallow bends less than a tube radius behind another: over so short a way a section of the centre line may mistake one
+/// for two.
+pub fn shallow_pairs(model: &TubeModel) -> Vec<usize> {
+    let bends = &model.lra.bends;
+    let shallow = |i: &usize| bends[i - 1].angle_rad + bends[*i].angle_rad < SHALLOW_RAD;
+    (1..bends.len()).filter(|i| bends[*i].length_mm < model.tube_radius_mm).filter(shallow).collect()
+}
+
 /// Whether the table is a curve of no straights cut into arcs: bend on bend in one plane, which a bender would bend as
 /// one. Fewer than [`FREE_FORM_JOINTS`] such joints may be a measurement's doubt about one bend.
 pub fn is_free_form(lra: &Lra, tube_radius_mm: f64) -> bool {

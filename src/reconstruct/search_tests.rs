@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::evidence::Solved;
 use super::fit::{Data, RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
-use super::moves::{doubled, drawn_apart, is_one, merged, with_wide_doubled, without_bend};
+use super::moves::{doubled, drawn_apart, is_one, merged, shallow_pairs, with_wide_doubled, without_bend};
 use super::normal;
 use super::reach::reaching;
 use super::sections::CentreLine;
@@ -229,4 +229,14 @@ fn arcs_of_one_bend_are_known_as_such() {
     assert!(!with(0.6, 0.0, 40.0), "a straight of 0.05 radii and more");
     assert!(!with(0.0, 0.011, 40.0), "a turn");
     assert!(!with(0.0, 0.0, 41.0), "another CLR");
+}
+
+#[test]
+fn shallow_bends_close_together_are_doubted() {
+    let pairs = |length_mm, second_rad| {
+        shallow_pairs(&tube(vec![bend(100.0, 0.0, 0.02), bend(length_mm, 1.0, second_rad)]))
+    };
+    assert_eq!(pairs(9.9, 0.02), [1]);
+    assert!(pairs(10.1, 0.02).is_empty(), "a tube radius between");
+    assert!(pairs(9.9, 0.34).is_empty(), "not shallow");
 }

@@ -10,7 +10,9 @@ use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
-use super::moves::{is_free_form, mean_radius_mm, with_common_radius, with_wide_doubled, without_bend};
+use super::moves::{
+    is_free_form, mean_radius_mm, merged, shallow_pairs, with_common_radius, with_wide_doubled, without_bend,
+};
 use super::profile::{Held, lengths};
 use super::reach::reaching;
 use super::scene::Scene;
@@ -198,17 +200,27 @@ impl Jury {
                 let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
                 at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
             };
-            let mut less: Vec<(usize, (Fit, f64))> = (0..bends.len())
+            let spine = best.model.spine();
+            let at_mm = |i: usize| spine.segments()[2 * i + 1].start_mm;
+            let dropped = (0..bends.len())
                 .filter(doubtful)
-                .map(|i| (i, self.fit_points(&mut sample, &without_bend(&best.model, i))))
-                .collect();
-            less.sort_by(|a, b| a.1.1.total_cmp(&b.1.1));
-            let Some((i, better)) = less.into_iter().next().filter(|l| l.1.1 < score) else {
+                .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&best.model, i)));
+            let pairs = shallow_pairs(&best.model).into_iter().filter_map(|i| {
+                let what = format!("two bends at {:.0} and {:.0} mm", at_mm(i - 1), at_mm(i));
+                Some((what, merged(&best.model, i)?))
+            });
+            let fewer: Vec<(String, TubeModel)> = dropped.chain(pairs).collect();
+            let fitted = fewer.into_iter().map(|(what, model)| (what, self.fit_points(&mut sample, &model)));
+            let least = fitted.min_by(|a, b| a.1.1.total_cmp(&b.1.1)).filter(|l| l.1.1 < score);
+            let Some((what, better)) = least else {
                 return self.structure(best.model);
             };
-            let at_mm = best.model.spine().segments()[2 * i + 1].start_mm;
-            let what = format!("the bend at {at_mm:.0} mm, not confirmed by the points, pulled straight");
-            self.decide(what, None, score - better.1, true);
+            self.decide(
+                format!("{what}, not confirmed by the points, taken back"),
+                None,
+                score - better.1,
+                true,
+            );
             (best, score) = better;
         }
     }
