@@ -1,6 +1,6 @@
-//! The search for the structure: the best tube so far changed by one bend at a time (dropped, merged, split, put in) as
-//! long as the measured centre line is better explained per value spent (Bayesian information criterion), then by one bend
-//! taken from one place to another, then with what looked like error taken for a bend.
+//! The search for the structure: the best tube so far with what looks like error taken for a bend, where that explains much;
+//! changed by one bend at a time (dropped, merged, split, put in) as long as the measured centre line is better explained
+//! per value spent (Bayesian information criterion); then by one bend taken from one place to another.
 //!
 //! Under `structure`, which gives it the tubes to begin with.
 

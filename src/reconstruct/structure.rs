@@ -191,46 +191,36 @@ impl Jury {
         let mut sample = Sample::new(sample, &model);
         let (mut best, mut score) = self.fit_points(&mut sample, &model);
         loop {
-            let bends = &best.model.lra.bends;
-            let bearable = DOUBT * self.price(5, 1) * self.correlation;
-            let doubtful = |i: &usize| {
-                if self.is_at_an_end(&best.model, *i) {
-                    return true;
-                }
-                let at = best.parameters.iter().position(|p| *p == Parameter::Angle(*i));
-                at.is_some_and(|j| bends[*i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
-            };
-            let spine = best.model.spine();
-            let at_mm = |i: usize| spine.segments()[2 * i + 1].start_mm;
-            let dropped = (0..bends.len())
-                .filter(doubtful)
-                .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&best.model, i)));
-            let pairs = shallow_pairs(&best.model).into_iter().filter_map(|i| {
-                let what = format!("two bends at {:.0} and {:.0} mm", at_mm(i - 1), at_mm(i));
-                Some((what, merged(&best.model, i)?))
-            });
-            let fewer: Vec<(String, TubeModel)> = dropped.chain(pairs).collect();
+            let fewer = self.with_fewer(&best);
             let fitted = fewer.into_iter().map(|(what, model)| (what, self.fit_points(&mut sample, &model)));
             let least = fitted.min_by(|a, b| a.1.1.total_cmp(&b.1.1)).filter(|l| l.1.1 < score);
             let Some((what, better)) = least else {
                 return self.structure(best.model);
             };
-            self.decide(
-                format!("{what}, not confirmed by the points, taken back"),
-                None,
-                score - better.1,
-                true,
-            );
+            let what = format!("{what}, not confirmed by the points, taken back");
+            self.decide(what, None, score - better.1, true);
             (best, score) = better;
         }
     }
 
-    /// Whether a bend is so near to an end that burr, bore and face are in its sections.
-    fn is_at_an_end(&self, model: &TubeModel, i: usize) -> bool {
-        let near_mm = END_RADII * model.tube_radius_mm;
-        let bends = &model.lra.bends;
-        (i == 0 && bends[0].length_mm < near_mm)
-            || (i + 1 == bends.len() && model.lra.last_length_mm < near_mm)
+    /// The tube without one of the bends that the points may not confirm; in words what goes.
+    fn with_fewer(&self, best: &Fit) -> Vec<(String, TubeModel)> {
+        let bends = &best.model.lra.bends;
+        let bearable = DOUBT * self.price(5, 1) * self.correlation;
+        let uncertain = |i: usize| {
+            let at = best.parameters.iter().position(|p| *p == Parameter::Angle(i));
+            at.is_some_and(|j| bends[i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
+        };
+        let spine = best.model.spine();
+        let at_mm = |i: usize| spine.segments()[2 * i + 1].start_mm;
+        let dropped = (0..bends.len())
+            .filter(|&i| is_at_an_end(&best.model, i) || uncertain(i))
+            .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&best.model, i)));
+        let pairs = shallow_pairs(&best.model).into_iter().filter_map(|i| {
+            let what = format!("two bends at {:.0} and {:.0} mm", at_mm(i - 1), at_mm(i));
+            Some((what, merged(&best.model, i)?))
+        });
+        dropped.chain(pairs).collect()
     }
 
     fn fit_points(&self, sample: &mut Sample, model: &TubeModel) -> (Fit, f64) {
@@ -241,6 +231,13 @@ impl Jury {
         let score = misfit + self.price(found.parameters.len(), model.lra.bends.len());
         (found, score)
     }
+}
+
+/// Whether a bend is so near to an end that burr, bore and face may be in its sections.
+fn is_at_an_end(model: &TubeModel, i: usize) -> bool {
+    let near_mm = END_RADII * model.tube_radius_mm;
+    let bends = &model.lra.bends;
+    (i == 0 && bends[0].length_mm < near_mm) || (i + 1 == bends.len() && model.lra.last_length_mm < near_mm)
 }
 
 fn radius_prior(model: &TubeModel) -> Option<RadiusPrior> {
