@@ -83,26 +83,7 @@ fn turn_round(found: Reconstruction) -> Reconstruction {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tube::{Alignment, Bend, Lra, Material, MeasuredTube, Tolerance};
-
-    fn part(lra: Lra, od_mm: f64) -> Nominal {
-        let material = Material {
-            key: "steel".to_owned(),
-            youngs_modulus_mpa: 2e5,
-            yield_mpa: 250.0,
-            strength_coefficient_mpa: 500.0,
-            hardening_exponent: 0.2,
-            usual_springback_rad: 0.03,
-        };
-        let tolerance = Tolerance {
-            envelope_mm: 1.0,
-            angle_rad: 0.01,
-            rotation_rad: 0.01,
-            length_mm: 0.5,
-            alignment: Alignment::BestFit,
-        };
-        Nominal { name: "part".to_owned(), od_mm, wall_mm: 1.0, material, die_clr_mm: 30.0, lra, tolerance }
-    }
+    use crate::tube::{Bend, Lra, MeasuredTube};
 
     #[test]
     fn a_tube_scanned_from_its_other_end_is_turned_round() {
@@ -118,7 +99,7 @@ mod tests {
         let measured = MeasuredTube::exact(&lra, 10.0);
         let found =
             Reconstruction { measured, spine: spine.clone(), lra, ovality_mm: vec![-0.1, -0.2, -0.3] };
-        let part = part(nominal.clone(), 25.0);
+        let part = Nominal::of_table(nominal.clone(), 25.0, 1.0);
         let turned = as_nominal(found, &part);
         assert_eq!(turned.measured.warnings.len(), 1, "the bracket's radius is another: {turned:?}");
         assert_eq!(turned.measured.reversed, Some(true));

@@ -241,9 +241,11 @@ fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<
 
 /// Tells the tube's points from the others.
 fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, warnings: Vec<String>) -> Scene {
-    let Tube { radius_mm, polygon, .. } = tube;
+    let Tube { radius_mm, polygon, around, .. } = tube;
+    let vertices = polygon.len();
     let polygon = reach::drawn_on(polygon, SPINE_SPACING_RADII * radius_mm, radius_mm, &rest.cloud);
-    let around = Surroundings::new(&polygon, radius_mm);
+    let same = polygon.len() == vertices;
+    let around = if same { around } else { Surroundings::new(&polygon, radius_mm) };
     let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
     // Thinning makes strays many: their share is that among any points.
     let some = any_share(cloud, SOME_POINTS);

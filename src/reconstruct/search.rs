@@ -44,7 +44,8 @@ const EXPLAINED: f64 = 0.05;
 
 /// A bend must move the tube by this many times what the passes lie apart: of passes 20 to 80 micrometres apart the bends that
 /// were none moved it by 1.1 to 2.7 times that, true ones by 3 and more.
-const ABOVE_PASSES: f64 = 2.75;
+pub(super) const ABOVE_PASSES: f64 = 2.75;
+
 /// One that explains more than so many bends' price is none of the passes' making.
 const DEAREST_NONE: f64 = 3.0;
 
@@ -204,9 +205,10 @@ impl Jury {
     /// The tube with neighbouring bends made one that are one for any bender, or of which one has an angle that is not
     /// known at all, unless much speaks against it.
     pub(super) fn united(&mut self, mut best: Candidate) -> Candidate {
+        let mut unsure = self.unsure(&best);
         let mut i = 1;
         while i < best.bends() {
-            let one = is_one(&best.model, i) || self.is_unsure(&best, i - 1) || self.is_unsure(&best, i);
+            let one = is_one(&best.model, i) || unsure[i - 1] || unsure[i];
             let one = one.then(|| merged(&best.model, i)).flatten();
             let fitted = one.map(|m| self.fit(&m, FULL_STEPS, f64::INFINITY));
             let bearable = best.score + DEAREST_NONE * self.price(5, 1);
@@ -216,6 +218,7 @@ impl Jury {
                     let what = format!("the arcs that meet at {at_mm:.0} mm are one bend");
                     self.decide(what, None, best.score - less.score, true);
                     best = less;
+                    unsure = self.unsure(&best);
                 }
                 None => i += 1,
             }
@@ -223,13 +226,18 @@ impl Jury {
         best
     }
 
-    /// Whether a bend's angle is not known from zero.
-    fn is_unsure(&self, best: &Candidate, i: usize) -> bool {
-        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+    /// How certainly a bend's angle differs from zero, in terms of the score.
+    fn angle_worth(&self, best: &Candidate, solved: &Solved, i: usize) -> f64 {
         let variance = self.line.noise_mm.powi(2) * self.correlation;
         let at = best.parameters.iter().position(|p| *p == Parameter::Angle(i));
-        let angle_rad = best.model.lra.bends[i].angle_rad;
-        at.is_some_and(|j| angle_rad.powi(2) < UNSURE.powi(2) * solved.inverse[(j, j)] * variance)
+        let square = best.model.lra.bends[i].angle_rad.powi(2);
+        at.map_or(0.0, |j| square / (solved.inverse[(j, j)] * variance).max(1e-300))
+    }
+
+    /// Which bends have an angle that is not known from zero.
+    fn unsure(&self, best: &Candidate) -> Vec<bool> {
+        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+        (0..best.bends()).map(|i| self.angle_worth(best, &solved, i) < UNSURE.powi(2)).collect()
     }
 
     /// The tube without the bends that move it by no more than its scan's passes disagree.
@@ -267,18 +275,11 @@ impl Jury {
         let model = &best.model;
         let n = model.lra.bends.len();
         let solved = Solved::new(&self.line, model, &best.parameters, self.prior);
-        let variance = self.line.noise_mm.powi(2) * self.correlation;
-        // How certainly a value differs from zero, in terms of the score.
-        let worth = |parameter: Parameter, value: f64| {
-            let at = best.parameters.iter().position(|p| *p == parameter);
-            at.map_or(0.0, |j| value * value / (solved.inverse[(j, j)] * variance).max(1e-300))
-        };
         let bearable = DOUBT * self.price(5, 1);
-        let bends = &model.lra.bends;
         let spine = model.spine();
         let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
         let change = |what: String, bend: Option<usize>, model: TubeModel| Change { what, bend, model };
-        let shallow = |i: &usize| worth(Parameter::Angle(*i), bends[*i].angle_rad) < bearable;
+        let shallow = |i: &usize| self.angle_worth(best, &solved, *i) < bearable;
         let dropped = (0..n).filter(shallow).map(|i| {
             change(format!("the bend at {:.0} mm pulled straight", at(i)), Some(i), without_bend(model, i))
         });

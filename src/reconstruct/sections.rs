@@ -36,7 +36,7 @@ const MOST_OUTSIDE: f64 = 0.25;
 const MOST_STRANGERS: f64 = 0.5;
 /// So near to an end, in tube radii, and no more than such a share of the end straight, burr, bore and face are among the
 /// points however few they are: a bend would be found there for them.
-const END_RADII: f64 = 0.75;
+const SILENT_RADII: f64 = 0.75;
 const END_SHARE: f64 = 0.375;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
@@ -366,7 +366,7 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
 
 /// Whether a place is where the end of the tube is seen.
 fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
-    let near = |straight_mm: f64| (END_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
+    let near = |straight_mm: f64| (SILENT_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
     let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
     at_mm < near(first_mm) || spine.length_mm() - at_mm < near(base.lra.last_length_mm)
 }

@@ -9,7 +9,7 @@ pub const SAW_SPREAD: f64 = 0.0017;
 const MITRE_SPREAD: f64 = 0.07;
 /// Share of the ends that are cut square: a saw that is set for a mitre is the rarer one.
 const SQUARE_SHARE: f64 = 0.85;
-/// So many standard deviations are to hold such a share of where the plane may be: of a normal distribution they hold that or more.
+/// So many standard deviations are to hold such a share of where the plane may be, as of a normal distribution they do.
 const WITHIN: [(f64, f64); 2] = [(2.0, 0.9545), (3.0, 0.9973)];
 
 /// A plane x = at + slope . (y, z) with its covariance.

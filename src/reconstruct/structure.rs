@@ -45,7 +45,7 @@ const KNOWN_RADIUS: f64 = 0.1;
 const DEAREST_COMMON: f64 = 20.0;
 
 /// A bend nearer to an end than so many tube radii must be confirmed by the points, however clear it is.
-const END_RADII: f64 = 2.0;
+const UNCONFIRMED_RADII: f64 = 2.0;
 
 /// Times that the sections are measured anew about the best tube.
 const MEASUREMENTS: usize = 4;
@@ -214,7 +214,7 @@ impl Jury {
         let spine = best.model.spine();
         let at_mm = |i: usize| spine.segments()[2 * i + 1].start_mm;
         let dropped = (0..bends.len())
-            .filter(|&i| is_at_an_end(&best.model, i) || uncertain(i))
+            .filter(|&i| is_beside_an_end(&best.model, i) || uncertain(i))
             .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&best.model, i)));
         let pairs = shallow_pairs(&best.model).into_iter().filter_map(|i| {
             let what = format!("two bends at {:.0} and {:.0} mm", at_mm(i - 1), at_mm(i));
@@ -234,8 +234,8 @@ impl Jury {
 }
 
 /// Whether a bend is so near to an end that burr, bore and face may be in its sections.
-fn is_at_an_end(model: &TubeModel, i: usize) -> bool {
-    let near_mm = END_RADII * model.tube_radius_mm;
+fn is_beside_an_end(model: &TubeModel, i: usize) -> bool {
+    let near_mm = UNCONFIRMED_RADII * model.tube_radius_mm;
     let bends = &model.lra.bends;
     (i == 0 && bends[0].length_mm < near_mm) || (i + 1 == bends.len() && model.lra.last_length_mm < near_mm)
 }

@@ -59,6 +59,23 @@ pub struct Nominal {
 const OTHER_TUBE_SHARE: f64 = 0.05;
 
 impl Nominal {
+    /// A part of this table for where only its shape matters: mild steel, usual tolerances, the first bend's die.
+    pub fn of_table(lra: Lra, od_mm: f64, wall_mm: f64) -> Nominal {
+        let material = Material {
+            key: "steel".to_owned(),
+            youngs_modulus_mpa: 2e5,
+            yield_mpa: 250.0,
+            strength_coefficient_mpa: 500.0,
+            hardening_exponent: 0.2,
+            usual_springback_rad: 0.03,
+        };
+        let (angle_rad, rotation_rad) = (0.3f64.to_radians(), 0.5f64.to_radians());
+        let alignment = Alignment::BestFit;
+        let tolerance = Tolerance { envelope_mm: 1.0, angle_rad, rotation_rad, length_mm: 0.5, alignment };
+        let die_clr_mm = lra.bends.first().map_or(od_mm, |b| b.radius_mm);
+        Nominal { name: "part".to_owned(), od_mm, wall_mm, material, die_clr_mm, lra, tolerance }
+    }
+
     /// Whether a tube of this radius cannot be the part, whatever its shape.
     pub fn is_other_tube(&self, tube_radius_mm: f64) -> bool {
         (2.0 * tube_radius_mm - self.od_mm).abs() > OTHER_TUBE_SHARE * self.od_mm

@@ -6,7 +6,7 @@ use super::super::evidence::Joint;
 use super::super::likeness::{is_formed, rows};
 use super::super::model::{Parameter, TubeModel};
 use super::super::moves::{split, with_bend};
-use super::super::search::JOINT_GAIN;
+use super::super::search::{ABOVE_PASSES, JOINT_GAIN};
 use super::super::stripes;
 use super::super::whole::Whole;
 use super::{FULL_STEPS, Guided, SIGMAS, fitted};
@@ -21,14 +21,12 @@ const MOST_OFF: usize = 3;
 const MOST_CORRELATION: f64 = 25.0;
 const PASSES_CORRELATION: f64 = 5.0;
 
-/// A joint that takes away such a share of all misfit is tried whatever the scatter (as in `search`).
+/// A joint that takes away such a share of all misfit is tried whatever the scatter (more than in `search`: each doubt costs a
+/// free search).
 const EXPLAINED: f64 = 0.2;
 
 /// A joint worth so many times what makes it looked at is more than one bend's.
 const MOST_GAIN: f64 = 10.0;
-
-/// A bend that moves the tube by less than so many times what the passes lie apart is their doing (as in `search`).
-const ABOVE_PASSES: f64 = 2.75;
 
 /// Forming and the die's wear change a CLR by less than this share of it.
 const DIE_SHARE: f64 = 0.2;

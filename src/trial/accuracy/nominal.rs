@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::sim::population::random_tube;
 use crate::sim::scan::TubeShape;
-use crate::tube::{Alignment, Bend, Frame, Lra, Material, Nominal, Spine, Tolerance};
+use crate::tube::{Bend, Frame, Lra, Nominal, Spine};
 
 /// Each angle springs back by this share of it, and is off by up to so much more either way.
 const SPRINGBACK: std::ops::Range<f64> = 0.01..0.04;
@@ -104,24 +104,7 @@ pub fn drawn(shape: &TubeShape, seed: u64) -> Drawn {
     }
     let reversed = rng.random_bool(0.5);
     let lra = if reversed { lra.reversed() } else { lra };
-    Drawn { nominal: part(lra, shape.od_mm, shape.wall_mm), reversed }
-}
-
-/// A part of this table; of the rest the reconstruction looks at nothing.
-fn part(lra: Lra, od_mm: f64, wall_mm: f64) -> Nominal {
-    let material = Material {
-        key: "steel".to_owned(),
-        youngs_modulus_mpa: 2e5,
-        yield_mpa: 250.0,
-        strength_coefficient_mpa: 500.0,
-        hardening_exponent: 0.2,
-        usual_springback_rad: 0.03,
-    };
-    let (angle_rad, rotation_rad) = (0.3f64.to_radians(), 0.5f64.to_radians());
-    let alignment = Alignment::BestFit;
-    let tolerance = Tolerance { envelope_mm: 1.0, angle_rad, rotation_rad, length_mm: 0.5, alignment };
-    let die_clr_mm = lra.bends.first().map_or(od_mm, |b| b.radius_mm);
-    Nominal { name: "part".to_owned(), od_mm, wall_mm, material, die_clr_mm, lra, tolerance }
+    Drawn { nominal: Nominal::of_table(lra, shape.od_mm, shape.wall_mm), reversed }
 }
 
 /// Whether the mirror image is another tube.
