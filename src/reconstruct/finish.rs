@@ -93,10 +93,10 @@ fn finish_as_chosen(
         let (radius_mm, bends) = (scene.radius_mm, best.model.lra.bends.len());
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
-    // Sigmas by what the points say together, not by their number.
-    best.covariance = profile::tightened(&best.information, &best.parameters, &chosen.held);
+    // Sigmas by what the points say together, not by their number; what is held was found so already.
     let correlation = correlation(&whole, &best);
-    best.covariance *= correlation.near;
+    let information = &best.information / correlation.near;
+    best.covariance = profile::tightened(&information, &best.parameters, &chosen.held);
     let ends = end_points(&whole, sample, &best);
     let mut measured = measure::measure(&mut best, ends, (correlation.along_arc / correlation.near).sqrt());
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
