@@ -15,6 +15,7 @@ use super::profile;
 use super::scene::Scene;
 use super::stretches::correlation;
 use super::structure::Structure;
+use super::undecided::{Undecided, widened};
 use super::whole::Whole;
 use super::{Reconstruction, TubeModel};
 use crate::cloud::PointCloud;
@@ -47,7 +48,11 @@ pub fn finish(
     if bends < 2 || !(first || last) {
         return found;
     }
-    let less = Structure { model: without_bend(&chosen.model, bend - 1), ..chosen.clone() };
+    let less = Structure {
+        model: without_bend(&chosen.model, bend - 1),
+        undecided: Undecided::new(),
+        ..chosen.clone()
+    };
     let mut trimmed = finish_as_chosen(cloud, &scene, &sample, &less)?;
     forget_end(&mut trimmed.measured, first);
     Ok(trimmed)
@@ -96,7 +101,8 @@ fn finish_as_chosen(
     // Sigmas by what the points say together, not by their number; what is held was found so already.
     let correlation = correlation(&whole, &best);
     let information = &best.information / correlation.near;
-    best.covariance = profile::tightened(&information, &best.parameters, &chosen.held);
+    let held = profile::tightened(&information, &best.parameters, &chosen.held);
+    best.covariance = widened(held, &best.parameters, &chosen.undecided);
     let ends = end_points(&whole, sample, &best);
     let mut measured = measure::measure(&mut best, ends, (correlation.along_arc / correlation.near).sqrt());
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {

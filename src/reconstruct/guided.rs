@@ -210,7 +210,8 @@ impl Guided {
             let polished = polish(&mut sample, &model, effort, &self.held);
             model = polished.unwrap_or_else(|| fit(&mut sample, &model, effort)).model;
         }
-        Structure { model, noise_mm, prior: self.prior, held: self.held.clone(), decisions: Vec::new() }
+        let (held, prior) = (self.held.clone(), self.prior);
+        Structure { model, noise_mm, prior, held, undecided: Vec::new(), decisions: Vec::new() }
     }
 
     fn sigma(&self, parameter: Parameter) -> Option<f64> {

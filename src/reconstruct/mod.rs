@@ -49,6 +49,7 @@ mod square;
 mod stretches;
 mod stripes;
 pub mod structure;
+mod undecided;
 mod whole;
 
 pub use error::ReconstructError;

@@ -20,6 +20,9 @@ const SHORT_RADII: f64 = 0.3;
 const HALVINGS: usize = 10;
 const STEPS: usize = 60;
 
+/// From a step that costs no more than this one goes to one that costs 1 as if costs grew by squares.
+const NEARLY_ONE: f64 = 5.0;
+
 /// A value with its standard deviation as found by moving it.
 pub type Held = (Parameter, f64);
 
@@ -57,20 +60,28 @@ pub fn lengths(
             Way { cutoff_mm: f64::INFINITY, noise_mm: line.noise_mm, steps: STEPS, goal: f64::INFINITY };
         2.0 * descend(&mut line.clone(), moved, &free, prior, way).pass.cost / unit
     };
+    // To both sides: down to where the straight is none the tube may hardly change, and up it changes at once.
     let spread = |(i, linear_mm): (usize, f64)| {
         let at = model.lra.bends[i].length_mm;
         let least = cost(i, at);
-        let mut step = linear_mm;
-        for _ in 0..HALVINGS {
-            let excess = cost(i, at + step) - least;
-            if excess <= 1.0 {
-                break;
-            }
-            step *= 0.5;
-        }
-        (Parameter::Length(i), step)
+        let side = |way_mm: f64| one_unit(way_mm.abs(), |step| cost(i, at + step * way_mm.signum()) - least);
+        let down_mm = if at > 0.0 { side(-linear_mm.min(at)) } else { 0.0 };
+        (Parameter::Length(i), side(linear_mm).max(down_mm))
     };
     found.map(spread).collect()
+}
+
+/// The step, no larger than `most`, that costs one unit of chi-squared by what halves of `most` cost.
+fn one_unit(most: f64, excess: impl Fn(f64) -> f64) -> f64 {
+    let mut step = most;
+    for _ in 0..HALVINGS {
+        let excess = excess(step);
+        if excess <= NEARLY_ONE {
+            return step / excess.max(1.0).sqrt();
+        }
+        step *= 0.5;
+    }
+    step
 }
 
 /// The covariance of this information with what was found of single values: as if each had been measured once more, so that

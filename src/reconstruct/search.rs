@@ -11,6 +11,7 @@ use super::fit::{RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
 use super::moves::{doubled, drawn_apart, is_one, likeliest_pairs, merged, split, with_bend, without_bend};
 use super::sections::CentreLine;
+use super::undecided::Undecided;
 use crate::tube::Decision;
 
 /// More bends than this are a coil or a hose, not a bent tube.
@@ -80,6 +81,8 @@ pub(super) struct Jury {
     pub correlation: f64,
     pub prior: Option<RadiusPrior>,
     pub decisions: Vec<Decision>,
+    /// What a choice between structures that was hardly one leaves open.
+    pub undecided: Undecided,
 }
 
 /// A change to be tried.

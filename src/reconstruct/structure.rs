@@ -20,6 +20,7 @@ use super::search::{Candidate, DOUBT, FULL_STEPS, Jury};
 use super::sections::CentreLine;
 use super::simplify::simplify;
 use super::stripes;
+use super::undecided::{self, Undecided};
 use super::whole::Whole;
 use crate::cloud::PointCloud;
 use crate::tube::Decision;
@@ -82,6 +83,8 @@ pub struct Structure {
     pub prior: Option<RadiusPrior>,
     /// What the linear covariance overstates.
     pub held: Vec<Held>,
+    /// What it leaves out.
+    pub undecided: Undecided,
     /// How it came about, and what was turned down at the end.
     pub decisions: Vec<Decision>,
 }
@@ -94,6 +97,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         correlation: 1.0,
         prior: None,
         decisions: Vec::new(),
+        undecided: Undecided::new(),
     };
     let starts: Vec<TubeModel> =
         TOLERANCES.par_iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
@@ -156,6 +160,7 @@ impl Jury {
         let what = "one CLR for all bends".to_owned();
         if gain > 0.0 {
             self.decide(what, None, gain, true);
+            self.undecided = undecided::between(&searched.model, &best_now.model, gain);
             return searched;
         }
         (self.decisions, self.correlation) = (before, correlation);
@@ -181,7 +186,8 @@ impl Jury {
     fn structure(self, model: TubeModel) -> Structure {
         let held = lengths(&self.line, &model, self.correlation, self.prior);
         let (noise_mm, prior, decisions) = (self.line.noise_mm, self.prior, self.decisions);
-        Structure { noise_mm, prior, held, decisions, model }
+        let undecided = undecided::of(self.undecided, &model);
+        Structure { noise_mm, prior, held, undecided, decisions, model }
     }
 
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
