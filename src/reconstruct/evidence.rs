@@ -14,6 +14,9 @@ use crate::tube::{Frame, Spine};
 /// A joint's freedom that has less than this share of its worth left is no news to the model.
 const NO_NEWS: f64 = 1e-5;
 
+/// The shorter part of a tube is taken for no less than this share of the longer one's worth, or rounding would tell of bends.
+const LEAST_PART: f64 = 1e-9;
+
 /// What a loose joint at one place of the tube would be worth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Joint {
@@ -82,8 +85,12 @@ impl Solved {
             }
             loose.push((0.5 * (places[i - 1] + places[i]), after.all.clone(), mixed));
         }
+        if let Some((segment, moment)) = self.moments.first() {
+            after.add(*segment, &Part::of(&symmetric(moment), &spine.segments()[*segment].start));
+        }
+        let whole = after.all.square;
         let test = |(at_mm, after, mixed): &(f64, Part, DMatrix<f64>)| {
-            let (gain, step) = self.test(after, mixed, &spine.frame_at(*at_mm));
+            let (gain, step) = self.test((after, &whole), mixed, &spine.frame_at(*at_mm));
             Joint {
                 at_mm: *at_mm,
                 gain: gain / (noise_mm * noise_mm),
@@ -94,8 +101,14 @@ impl Solved {
         loose.par_iter().rev().map(test).collect()
     }
 
-    /// Gain and best step of a joint's freedoms: shift along x and turns about x, y, z of `frame`.
-    fn test(&self, after: &Part, mixed: &DMatrix<f64>, frame: &Frame) -> (f64, Vector4<f64>) {
+    /// Gain and best step of a joint's freedoms: shift along x and turns about x, y, z of `frame`. What lies `after` it moves, of
+    /// all that there is; what lies before it might as well.
+    fn test(
+        &self,
+        (after, whole): (&Part, &Matrix6<f64>),
+        mixed: &DMatrix<f64>,
+        frame: &Frame,
+    ) -> (f64, Vector4<f64>) {
         let back: Matrix6<f64> = to_segment(&frame.inverse());
         let free = Matrix6x4::from_columns(&[0, 3, 4, 5].map(|k| back.column(k).into_owned()));
         let mixed = mixed * free;
@@ -104,8 +117,12 @@ impl Solved {
         let left = square - Matrix4::from_iterator((mixed.transpose() * &solved).iter().copied());
         let right = free.transpose() * after.gradient()
             - Vector4::from_iterator((solved.transpose() * &self.gradient).iter().copied());
-        // In units of what each freedom would be worth alone; what the model has already has no worth left.
-        let scale = square.diagonal().map(|d| 1.0 / d.max(1e-12).sqrt());
+        // In units of what each freedom would be worth alone, by the shorter part: of a long tube a turn near its first end would
+        // seem to be worth nothing. What the model has already has no worth left.
+        let before = (free.transpose() * (whole - after.square) * free).diagonal();
+        let worth =
+            square.diagonal().zip_map(&before, |after, before| before.max(LEAST_PART * after).min(after));
+        let scale = worth.map(|w| 1.0 / w.max(1e-12).sqrt());
         let scaled = Matrix4::from_fn(|i, j| left[(i, j)] * scale[i] * scale[j]);
         let eigen = SymmetricEigen::new((scaled + scaled.transpose()) * 0.5);
         let (mut step, mut gain) = (Vector4::zeros(), 0.0);
