@@ -64,14 +64,19 @@ pub fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
         None => out.lra.last_length_mm += length,
     }
     turn_into_pose(&mut out);
-    // The longer part stays where it is.
-    let (old, new) = (model.spine(), out.spine());
-    if let (Some(was), Some(is)) = (old.segments().get(2 * i + 3), new.segments().get(2 * i + 1))
-        && old.length_mm() - was.start_mm > was.start_mm
+    with_longer_part_in_place(model, i + 1, out, i)
+}
+
+/// A changed tube whose bend `new` is the `old` one of the tube before and the first behind the change: what lies behind stays
+/// where it is if that is the longer part. From a swing of the longer part no fit finds back.
+fn with_longer_part_in_place(before: &TubeModel, old: usize, mut after: TubeModel, new: usize) -> TubeModel {
+    let (spine, changed) = (before.spine(), after.spine());
+    if let (Some(was), Some(is)) = (spine.segments().get(2 * old + 1), changed.segments().get(2 * new + 1))
+        && spine.length_mm() - was.start_mm > was.start_mm
     {
-        out.start = was.start * is.start.inverse() * out.start;
+        after.start = was.start * is.start.inverse() * after.start;
     }
-    out
+    after
 }
 
 /// The first row's rotation belongs into the pose.
@@ -154,7 +159,7 @@ pub fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {
         None => out.lra.last_length_mm += rest,
     }
     turn_into_pose(&mut out);
-    Some(out)
+    Some(with_longer_part_in_place(model, i + 1, out, i))
 }
 
 /// The bends at (or just beside) a joint, each as two with a straight between.
@@ -176,7 +181,7 @@ pub fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
         let rotation_rad = joint.turn_rad.x.clamp(-0.5, 0.5);
         out.lra.bends.insert(k / 2 + 1, Bend { length_mm, rotation_rad, angle_rad, ..whole });
         out.ovality_mm.insert(k / 2, model.ovality_mm[k / 2]);
-        out
+        with_longer_part_in_place(model, k / 2 + 1, out, k / 2 + 2)
     };
     arcs.map(apart).collect()
 }
@@ -194,7 +199,7 @@ pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
     out.lra.bends[i] = half;
     out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
     out.ovality_mm.insert(i, 0.0);
-    Some(out)
+    Some(with_longer_part_in_place(model, i + 1, out, i + 2))
 }
 
 /// Bends the other way with no straight between, drawn apart by a tube radius; both arcs give way. A straight at its least
@@ -210,7 +215,7 @@ pub fn drawn_apart(model: &TubeModel, i: usize) -> Option<TubeModel> {
     let arcs = pair[0].radius_mm + pair[1].radius_mm;
     pair.iter_mut().for_each(|b| b.angle_rad = (b.angle_rad - radius / arcs).max(0.0));
     pair[1].length_mm += radius;
-    Some(out)
+    Some(with_longer_part_in_place(model, i + 1, out, i + 1))
 }
 
 /// The tube with all bends that are much wider than the others as two.
@@ -260,5 +265,5 @@ fn insert(model: &TubeModel, row: usize, along_mm: f64, joint: &Joint) -> TubeMo
     out.lra.bends.insert(row, bend);
     out.ovality_mm.insert(row, 0.0);
     turn_into_pose(&mut out);
-    out
+    with_longer_part_in_place(model, row, out, row + 1)
 }
