@@ -140,8 +140,11 @@ impl CentreLine {
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
+        let alone: Vec<bool> = grouped.iter().zip(&fits).map(|(s, f)| !is_crowded(s, f, cutoff)).collect();
+        // What crowds one section reaches into the next, in however few points.
+        let among = |i: usize| alone[i.saturating_sub(1)..(i + 2).min(alone.len())].iter().all(|a| *a);
         let (mut sections, mut crowded) = (Vec::new(), Vec::new());
-        for ((place, seen), fit) in bins.places().zip(&grouped).zip(&fits) {
+        for (i, ((place, seen), fit)) in bins.places().zip(&grouped).zip(&fits).enumerate() {
             let mut sums = sums(seen, fit, cutoff);
             let count = sums[(0, 0)];
             if count < 1.0 {
@@ -152,7 +155,7 @@ impl CentreLine {
             let frame = segment.frame_at(along);
             // Before the first fit the radius is a guess: all points may look like strangers.
             let at_mm = segment.start_mm + along;
-            if fitted && (is_at_an_end(base, &spine, at_mm) || is_crowded(seen, fit, cutoff)) {
+            if fitted && (is_at_an_end(base, &spine, at_mm) || !among(i)) {
                 crowded.push(frame.translation.vector.into());
                 continue;
             }
