@@ -143,9 +143,12 @@ impl CentreLine {
         let alone: Vec<bool> = grouped.iter().zip(&fits).map(|(s, f)| !is_crowded(s, f, cutoff)).collect();
         // What crowds one section reaches into the next, in however few points.
         let among = |i: usize| alone[i.saturating_sub(1)..(i + 2).min(alone.len())].iter().all(|a| *a);
+        let nowhere_else = Values::zeros();
         let (mut sections, mut crowded) = (Vec::new(), Vec::new());
         for (i, ((place, seen), fit)) in bins.places().zip(&grouped).zip(&fits).enumerate() {
-            let mut sums = sums(seen, fit, cutoff);
+            // So few points lie on some section or other, a flying one among them too: that of the base tells which.
+            let few = fitted && (seen.len() as f64) < JUDGED_POINTS;
+            let mut sums = sums(seen, if few { &nowhere_else } else { fit }, cutoff);
             let count = sums[(0, 0)];
             if count < 1.0 {
                 continue;
