@@ -35,12 +35,28 @@ impl PointCloud {
     /// One point per occupied voxel, the one nearest to the mean of the voxel's points, in voxel order. No
     /// point is moved, so noise is not averaged away.
     pub fn thinned(&self, cell_mm: f64) -> PointCloud {
+        self.thinned_of(cell_mm, |_| 1.0)
+    }
+
+    /// The same without the voxels of a single point where they hold several as a rule: a flying point has a voxel of its own,
+    /// and few of them among many points would be many among those that thinning leaves.
+    pub fn thinned_without_strays(&self, cell_mm: f64) -> PointCloud {
+        self.thinned_of(cell_mm, |usual| if usual >= SEVERAL { 2.0 } else { 1.0 })
+    }
+
+    /// One point of each voxel that holds enough of them, told how many they hold on average.
+    fn thinned_of(&self, cell_mm: f64, enough: impl Fn(f64) -> f64) -> PointCloud {
         let Some(voxels) = Voxels::of(self, cell_mm) else { return self.clone() };
+        let enough = enough(self.len() as f64 / voxels.order.len() as f64);
         let central = voxels.central(self);
-        let kept: Vec<u32> = voxels.order.iter().map(|&voxel| central[voxel as usize]).collect();
+        let holds = |voxel: &&u32| voxels.totals[**voxel as usize].count >= enough;
+        let kept: Vec<u32> = voxels.order.iter().filter(holds).map(|&v| central[v as usize]).collect();
         self.pick(&kept)
     }
 }
+
+/// So many points on average are several: of a surface scanned as densely hardly a voxel holds one alone.
+const SEVERAL: f64 = 5.0;
 
 /// A cloud's occupied voxels.
 struct Voxels {

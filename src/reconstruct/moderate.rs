@@ -39,11 +39,11 @@ pub fn moderate(cloud: &PointCloud) -> Moderate {
     }
     let share = any_share(cloud, MOST_SORTED);
     let mut spacing_mm = (area_mm2(&any_share(&share, PROBE_POINTS)) / ENOUGH_POINTS as f64).sqrt();
-    let mut out = share.thinned(spacing_mm);
+    let mut out = share.thinned_without_strays(spacing_mm);
     // On a tube thinner than the probe's cells the area comes out too large.
     while out.len() < ENOUGH_POINTS / 2 && out.len() < share.len() / 2 {
         spacing_mm *= (out.len() as f64 / ENOUGH_POINTS as f64).sqrt();
-        out = share.thinned(spacing_mm);
+        out = share.thinned_without_strays(spacing_mm);
     }
     Moderate { cloud: out, spacing_mm }
 }
