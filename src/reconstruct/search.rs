@@ -157,6 +157,21 @@ impl Jury {
         best
     }
 
+    /// A tube that runs nowhere farther than `most_mm` from the line that the sections were taken about: changed as in the
+    /// search until it does, if it comes to that.
+    pub(super) fn nearer(&self, mut first: Candidate, most_mm: f64) -> Candidate {
+        for _ in 0..ROUNDS {
+            if self.line.farthest_mm(&first.model) < most_mm {
+                break;
+            }
+            let tried = self.tried(&first).into_iter().map(|(_, candidate)| candidate);
+            let best = tried.min_by(|a, b| a.score.total_cmp(&b.score));
+            let Some(better) = best.filter(|b| b.score < first.score - LEAST_GAIN) else { break };
+            first = self.fit(&better.model, FULL_STEPS, f64::INFINITY);
+        }
+        first
+    }
+
     /// The best candidate with one bend taken out and one put in elsewhere, if that is better: two shallow bends of which
     /// one has taken the other's part are no step of one bend away from right.
     fn moved(&mut self, best: &Candidate, tried: &[(Change, Candidate)]) -> Option<Candidate> {

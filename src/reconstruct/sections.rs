@@ -38,6 +38,11 @@ const MOST_STRANGERS: f64 = 0.5;
 /// points however few they are: a bend would be found there for them.
 const SILENT_RADII: f64 = 0.75;
 const END_SHARE: f64 = 0.375;
+/// So far from an end, in tube radii, burr, bore and face may reach; a section there that misses the tube's shape so many
+/// times more than is usual has some of them; and what its radius and ovality may be off at most, in tube radii.
+const DAMAGED_RADII: f64 = 2.0;
+const DAMAGED: f64 = 5.0;
+const TUBES_OWN: f64 = 1e-4;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 
@@ -176,6 +181,10 @@ impl CentreLine {
                 least,
             });
         }
+        if fitted {
+            let ends = without_damaged_ends(&mut sections, base, &spine, noise);
+            crowded.extend(ends);
+        }
         let count = sections.iter().map(|s| s.count).sum();
         let reach_mm = base.tube_radius_mm.hypot(0.5 * bins.length_mm);
         CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded, reach_mm }
@@ -195,6 +204,13 @@ impl CentreLine {
             most = most.max((values[1] - places[i].0).hypot(values[2] - places[i].1));
             i += 1;
         });
+        most
+    }
+
+    /// How far a tube runs from the line that the sections were taken about, at most.
+    pub fn farthest_mm(&self, model: &TubeModel) -> f64 {
+        let mut most = 0.0_f64;
+        self.walk(model, |_, _, values, _| most = most.max(values[1].hypot(values[2])));
         most
     }
 
@@ -375,6 +391,22 @@ fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
     let near = |straight_mm: f64| (SILENT_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
     let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
     at_mm < near(first_mm) || spine.length_mm() - at_mm < near(base.lra.last_length_mm)
+}
+
+/// Takes the sections near the ends away that have not the tube's shape, wherever they lie: a burr, a bore, a face is among
+/// their points, in however few of them. Returns where they were.
+fn without_damaged_ends(sections: &mut Vec<Section>, base: &TubeModel, spine: &Spine, noise_mm: f64) -> Vec<Point3<f64>> {
+    let shape = [TUBES_OWN, 0.3, 0.3, TUBES_OWN, TUBES_OWN].map(|s| s * base.tube_radius_mm);
+    let misfit = |s: &Section| (cost(&s.sums, &solve(&s.sums, &shape, noise_mm)) - s.least) / (noise_mm * noise_mm);
+    let usual = median(&mut sections.iter().map(misfit).collect::<Vec<_>>()).unwrap_or(0.0);
+    let near_mm = DAMAGED_RADII * base.tube_radius_mm;
+    let is_damaged = |s: &Section| {
+        let at_mm = spine.closest(&s.centre).arc_length_mm;
+        at_mm.min(spine.length_mm() - at_mm) < near_mm && misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2)
+    };
+    let damaged = sections.iter().filter(|s| is_damaged(s)).map(|s| s.centre).collect();
+    sections.retain(|s| !is_damaged(s));
+    damaged
 }
 
 /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.

@@ -36,6 +36,9 @@ const ARC_FACTOR: f64 = 2.5;
 /// Candidates whose scores differ by less are one: about what a fit leaves unresolved.
 const SAME_SCORE: f64 = 0.01;
 
+/// Where a tube strays farther from the polygon, in radii, the points of its sections do not lie on one section.
+const STRAYED_RADII: f64 = 0.03;
+
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
 
@@ -105,8 +108,9 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         starts.par_iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
     rough.sort_by(|a, b| a.score.total_cmp(&b.score));
     rough.dedup_by(|b, a| b.score - a.score < SAME_SCORE && b.parameters.len() == a.parameters.len());
-    let first = rough.first()?;
+    let first = jury.nearer(rough.first()?.clone(), STRAYED_RADII * radius_mm);
     jury.line = CentreLine::measure(sample, &first.model, false);
+    rough.insert(0, first);
     let fitted: Vec<Candidate> =
         rough.par_iter().map(|c| jury.fit(&c.model, FULL_STEPS, f64::INFINITY)).collect();
     let clearest = fitted.iter().min_by(|a, b| a.score.total_cmp(&b.score))?;
@@ -119,10 +123,10 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
         jury.correlation = jury.line.correlation(&best.model);
         best = jury.judge(best.model);
-        let bends = best.bends();
-        let before = best.score;
+        let before = best.clone();
         best = jury.search(best);
-        if best.score >= before && best.bends() == bends {
+        // The search may have learned how many points say one thing: what was before is judged by that, too.
+        if best.bends() == before.bends() && best.score >= jury.judge(before.model).score {
             break;
         }
     }
