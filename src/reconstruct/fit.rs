@@ -131,6 +131,9 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
 /// the square of this.
 const LAST_STEP_SIGMAS: f64 = 0.3;
 
+/// A step that leaves less than this share of the points on the tube leads astray.
+const LEAST_KEPT: f64 = 0.95;
+
 /// Takes a model that is nearly there to all points: Newton's steps, cut-off and all, until what is left is nothing beside
 /// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once or lead astray. Values that
 /// the linear equations leave open are kept within their own standard deviations (`held`).
@@ -143,9 +146,13 @@ pub fn polish(
     let parameters = start.parameters();
     let mut model = start.clone();
     let mut cutoff_mm = effort.cutoff_mm;
-    let (mut before, mut cost) = (f64::INFINITY, f64::INFINITY);
+    let (mut before, mut cost, mut used) = (f64::INFINITY, f64::INFINITY, 0.0);
     for passes in 1..=effort.steps {
         let pass = data.pass(&model, cutoff_mm);
+        if (pass.used() as f64) < LEAST_KEPT * used {
+            return None;
+        }
+        used = pass.used() as f64;
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
         let all = expectant_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
         let (mut normal, gradient) = held_at_bounds(&model, &parameters, all);

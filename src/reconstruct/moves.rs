@@ -186,7 +186,8 @@ pub fn split(model: &TubeModel, joint: &Joint) -> Vec<TubeModel> {
     arcs.map(apart).collect()
 }
 
-/// A bend that is much wider than the others as two of the usual radius at its ends.
+/// A bend that is much wider than the others as two of the usual radius, at a quarter and three quarters of it: an arc strays
+/// least from two short bends when it is twice as long as they are apart.
 pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
     let whole = model.lra.bends[i];
     let usual = mean_radius_mm(model)?;
@@ -195,10 +196,14 @@ pub fn doubled(model: &TubeModel, i: usize) -> Option<TubeModel> {
     }
     let mut out = model.clone();
     let half = Bend { angle_rad: 0.5 * whole.angle_rad, radius_mm: usual, ..whole };
-    let between = (whole.radius_mm - usual) * whole.angle_rad;
-    out.lra.bends[i] = half;
-    out.lra.bends.insert(i + 1, Bend { length_mm: between, rotation_rad: 0.0, ..half });
+    let spare = (whole.radius_mm - usual) * whole.angle_rad;
+    out.lra.bends[i] = Bend { length_mm: whole.length_mm + 0.25 * spare, ..half };
+    out.lra.bends.insert(i + 1, Bend { length_mm: 0.5 * spare, rotation_rad: 0.0, ..half });
     out.ovality_mm.insert(i, 0.0);
+    match out.lra.bends.get_mut(i + 2) {
+        Some(next) => next.length_mm += 0.25 * spare,
+        None => out.lra.last_length_mm += 0.25 * spare,
+    }
     Some(with_longer_part_in_place(model, i + 1, out, i + 2))
 }
 
