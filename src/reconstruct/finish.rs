@@ -12,13 +12,11 @@ use super::moments::Sample;
 use super::moves::without_bend;
 use super::outline::solid_start;
 use super::profile;
-use super::scene::Scene;
 use super::stretches::correlation;
-use super::structure::Structure;
+use super::structure::{Shown, Structure};
 use super::undecided::{Undecided, widened};
 use super::whole::Whole;
 use super::{Reconstruction, TubeModel};
-use crate::cloud::PointCloud;
 use crate::tube::MeasuredTube;
 
 /// An angle is never left open: a tube with one less certain than this was not measured.
@@ -36,12 +34,11 @@ const END_POINTS: f64 = 60_000.0;
 /// Fits and measures the tube. A bend at one of its ends whose angle the points do not tell is a few points of
 /// something that touches the tube there, a jaw or a lip: it is left out, and that end's length is not known.
 pub fn finish(
-    cloud: &PointCloud,
-    scene: Scene,
-    sample: Vec<Point3<f64>>,
+    shown: &Shown,
+    warnings: &[String],
     chosen: &Structure,
 ) -> Result<Reconstruction, ReconstructError> {
-    let found = finish_as_chosen(cloud, &scene, &sample, chosen);
+    let found = finish_as_chosen(shown, warnings, chosen);
     let Err(ReconstructError::Undetermined { bend, .. }) = &found else { return found };
     let bends = chosen.model.lra.bends.len();
     let (first, last) = (*bend == 1, *bend == bends);
@@ -53,7 +50,7 @@ pub fn finish(
         undecided: Undecided::new(),
         ..chosen.clone()
     };
-    let mut trimmed = finish_as_chosen(cloud, &scene, &sample, &less)?;
+    let mut trimmed = finish_as_chosen(shown, warnings, &less)?;
     forget_end(&mut trimmed.measured, first);
     Ok(trimmed)
 }
@@ -86,16 +83,15 @@ fn forget_end(tube: &mut MeasuredTube, first: bool) {
 }
 
 fn finish_as_chosen(
-    cloud: &PointCloud,
-    scene: &Scene,
-    sample: &[Point3<f64>],
+    shown: &Shown,
+    warnings: &[String],
     chosen: &Structure,
 ) -> Result<Reconstruction, ReconstructError> {
-    let mut whole = Whole::new(cloud, scene.own.as_deref());
+    let mut whole = shown.whole;
     let points = whole.len();
     let mut best = fit_to_all(&mut whole, chosen);
     if (best.used as f64) < LEAST_USED_SHARE * points as f64 {
-        let (radius_mm, bends) = (scene.radius_mm, best.model.lra.bends.len());
+        let (radius_mm, bends) = (shown.radius_mm, best.model.lra.bends.len());
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
     // Sigmas by what the points say together, not by their number; what is held was found so already.
@@ -103,7 +99,7 @@ fn finish_as_chosen(
     let information = &best.information / correlation.near;
     let held = profile::tightened(&information, &best.parameters, &chosen.held);
     best.covariance = widened(held, &best.parameters, &chosen.undecided);
-    let ends = end_points(&whole, sample, &best);
+    let ends = end_points(&whole, shown.sample, &best);
     let mut measured = measure::measure(&mut best, ends, (correlation.along_arc / correlation.near).sqrt());
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
@@ -114,8 +110,8 @@ fn finish_as_chosen(
     }
     measured.residual_median_mm = best.median_mm;
     measured.decisions.clone_from(&chosen.decisions);
-    measured.points_total = cloud.len();
-    measured.warnings.splice(0..0, scene.warnings.iter().cloned());
+    measured.points_total = whole.file_len();
+    measured.warnings.splice(0..0, warnings.iter().cloned());
     let TubeModel { lra, ovality_mm, .. } = best.model.clone();
     Ok(Reconstruction { measured, spine: best.model.spine(), lra, ovality_mm })
 }

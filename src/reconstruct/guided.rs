@@ -211,7 +211,8 @@ impl Guided {
             model = polished.unwrap_or_else(|| fit(&mut sample, &model, effort)).model;
         }
         let (held, prior) = (self.held.clone(), self.prior);
-        Structure { model, noise_mm, prior, held, undecided: Vec::new(), decisions: Vec::new() }
+        let correlation = self.correlation;
+        Structure { model, noise_mm, correlation, prior, held, undecided: Vec::new(), decisions: Vec::new() }
     }
 
     fn sigma(&self, parameter: Parameter) -> Option<f64> {

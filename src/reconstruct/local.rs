@@ -156,6 +156,20 @@ impl Local {
         }
     }
 
+    /// Unit direction from the axis to a point, in the segment's frame.
+    pub fn outward(&self, p: [f64; 3]) -> Vector3<f64> {
+        let (u, v) = self.across(p);
+        let out = match &self.arc {
+            None => Vector3::new(0.0, u, v),
+            Some(arc) => {
+                let y = p[1] - arc.radius_mm;
+                let ring = p[0].hypot(y).max(1e-12);
+                Vector3::new(u * p[0] / ring, u * y / ring, v)
+            }
+        };
+        out / u.hypot(v).max(1e-12)
+    }
+
     /// How oval the section is where a point faces the segment: [`Arc::ramp`].
     pub fn ramp_at(&self, p: [f64; 3], tube_radius_mm: f64) -> f64 {
         let Some(arc) = &self.arc else { return 0.0 };

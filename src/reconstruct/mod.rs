@@ -38,6 +38,7 @@ mod places;
 mod profile;
 pub mod radius;
 mod reach;
+mod realign;
 pub mod scene;
 mod search;
 #[cfg(test)]
@@ -54,12 +55,14 @@ mod whole;
 
 pub use error::ReconstructError;
 use nalgebra::Point3;
+use rayon::prelude::*;
 
 use crate::cloud::PointCloud;
-use crate::tube::{Lra, MeasuredTube, Nominal, Spine};
+use crate::tube::{Decision, Lra, MeasuredTube, Nominal, Spine};
 use model::TubeModel;
 use scene::Scene;
 use structure::Shown;
+use whole::ScanPass;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -138,6 +141,22 @@ fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
 }
 
+/// Points of the sample that is drawn from passes moved onto each other; and how near to the tube they must be, in tube radii.
+const MOST_DRAWN: usize = 100_000;
+const NEAR_RADII: f64 = 0.4;
+
+/// The sample of a tube with its scan's passes where they belong; as it was where there is one pass.
+fn together(shown: &Shown, passes: &[ScanPass], model: &TubeModel) -> Vec<Point3<f64>> {
+    if passes.is_empty() {
+        return shown.sample.to_vec();
+    }
+    let (spine, radius_mm) = (model.spine(), model.tube_radius_mm);
+    let is_near = |p: &Point3<f64>| (spine.closest(p).distance_mm - radius_mm).abs() < NEAR_RADII * radius_mm;
+    let drawn = shown.whole.moved(passes).share(MOST_DRAWN);
+    let near: Vec<Point3<f64>> = drawn.into_par_iter().filter(is_near).collect();
+    PointCloud::from_points(&near).thinned_without_strays(SAMPLE_CELL_RADII * radius_mm).iter().collect()
+}
+
 /// Reconstructs with the structure by `guide`, or freely.
 fn by(
     cloud: &PointCloud,
@@ -155,17 +174,26 @@ fn by(
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
+    let choose = |shown: &Shown| match guide {
+        Some(nominal) => guided::choose(shown, nominal),
+        None => structure::choose(shown).map(|s| (s, Vec::new())),
+    };
     let shown = Shown::new(cloud, &scene, &sample);
-    let chosen = in_pool(|| match guide {
-        Some(nominal) => guided::choose(&shown, nominal),
-        None => structure::choose(&shown).map(|s| (s, Vec::new())),
-    });
-    let (chosen, notes) = chosen.ok_or_else(not_bent)?;
+    let (mut chosen, mut notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
+    let (passes, gain) =
+        in_pool(|| realign::realigned(&shown.whole, &chosen.model, chosen.noise_mm, chosen.correlation));
+    let again = in_pool(|| together(&shown, &passes, &chosen.model));
+    let shown = Shown { whole: shown.whole.moved(&passes), sample: &again, ..shown };
+    if !passes.is_empty() {
+        (chosen, notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
+        let what = format!("{} passes of the scan moved onto each other", passes.len());
+        chosen.decisions.push(Decision { what, bend: None, gain, kept: true });
+    }
     if moves::is_free_form(&chosen.model.lra, radius_mm) {
         return Err(not_bent());
     }
     begins(Stage::Fit);
-    let mut found = in_pool(|| finish::finish(cloud, scene, sample, &chosen))?;
+    let mut found = in_pool(|| finish::finish(&shown, &scene.warnings, &chosen))?;
     found.measured.warnings.extend(notes);
     Ok(match options.nominal {
         Some(nominal) => direction::as_nominal(found, nominal),

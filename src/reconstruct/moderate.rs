@@ -51,13 +51,17 @@ pub fn moderate(cloud: &PointCloud) -> Moderate {
 /// At most `most` of a cloud's points, one drawn from each of as many equal runs: in a file's order a fixed
 /// stride could fall into step with the scanner's stripes.
 pub fn any_share(cloud: &PointCloud, most: usize) -> PointCloud {
-    let run = cloud.len().div_ceil(most.max(1)).max(1);
-    if run == 1 {
+    if cloud.len() <= most {
         return cloud.clone();
     }
+    cloud.select(&drawn(cloud.len(), most))
+}
+
+/// Indices of at most `most` of so many points, one drawn from each of as many equal runs.
+pub fn drawn(points: usize, most: usize) -> Vec<usize> {
+    let run = points.div_ceil(most.max(1)).max(1);
     let draw = |k: usize| k * run + (scrambled(k as u64) % run as u64) as usize;
-    let drawn: Vec<usize> = (0..cloud.len() / run).map(draw).collect();
-    cloud.select(&drawn)
+    (0..points / run).map(draw).collect()
 }
 
 /// The finaliser of SplitMix64 (G. L. Steele et al., OOPSLA 2014).

@@ -395,9 +395,15 @@ fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
 
 /// Takes the sections near the ends away that have not the tube's shape, wherever they lie: a burr, a bore, a face is among
 /// their points, in however few of them. Returns where they were.
-fn without_damaged_ends(sections: &mut Vec<Section>, base: &TubeModel, spine: &Spine, noise_mm: f64) -> Vec<Point3<f64>> {
+fn without_damaged_ends(
+    sections: &mut Vec<Section>,
+    base: &TubeModel,
+    spine: &Spine,
+    noise_mm: f64,
+) -> Vec<Point3<f64>> {
     let shape = [TUBES_OWN, 0.3, 0.3, TUBES_OWN, TUBES_OWN].map(|s| s * base.tube_radius_mm);
-    let misfit = |s: &Section| (cost(&s.sums, &solve(&s.sums, &shape, noise_mm)) - s.least) / (noise_mm * noise_mm);
+    let misfit =
+        |s: &Section| (cost(&s.sums, &solve(&s.sums, &shape, noise_mm)) - s.least) / (noise_mm * noise_mm);
     let usual = median(&mut sections.iter().map(misfit).collect::<Vec<_>>()).unwrap_or(0.0);
     let near_mm = DAMAGED_RADII * base.tube_radius_mm;
     let is_damaged = |s: &Section| {

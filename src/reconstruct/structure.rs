@@ -82,6 +82,8 @@ pub struct Structure {
     pub model: TubeModel,
     /// Standard deviation of a point about the surface.
     pub noise_mm: f64,
+    /// How many points say one thing.
+    pub correlation: f64,
     /// Expectation of the bend radii that it was fitted with.
     pub prior: Option<RadiusPrior>,
     /// What the linear covariance overstates.
@@ -191,7 +193,8 @@ impl Jury {
         let held = lengths(&self.line, &model, self.correlation, self.prior);
         let (noise_mm, prior, decisions) = (self.line.noise_mm, self.prior, self.decisions);
         let undecided = undecided::of(self.undecided, &model);
-        Structure { noise_mm, prior, held, undecided, decisions, model }
+        let correlation = self.correlation;
+        Structure { noise_mm, correlation, prior, held, undecided, decisions, model }
     }
 
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few

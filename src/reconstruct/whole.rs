@@ -10,7 +10,9 @@ use super::fit::Data;
 use super::lanes::Adder;
 use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
+use super::moderate::drawn;
 use super::moments::{CHUNK, Pass};
+
 use crate::cloud::PointCloud;
 use crate::tube::{Frame, Spine};
 
@@ -20,25 +22,36 @@ const MOST_CHUNKS: usize = 64;
 /// The tube is taken to go on this many radii beyond its first guess of the ends.
 const BEYOND_RADII: f64 = 2.0;
 
-/// A cloud's points, or those of them that are the tube's.
+/// A cloud's points, or those of them that are the tube's; as they lie, or pass by pass where they belong.
 #[derive(Debug, Clone, Copy)]
 pub struct Whole<'a> {
     cloud: &'a PointCloud,
     own: Option<&'a [u32]>,
+    passes: &'a [ScanPass],
+}
+
+/// Consecutive points of a scan that moved as one, from where those of the pass before end: a pass of the arm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScanPass {
+    /// Index behind its last point; of the last pass no less than the cloud's length.
+    pub end: u32,
+    /// What takes its points to where they belong.
+    pub motion: Frame,
 }
 
 /// A segment as the cloud's offsets see it.
 struct View {
     turn: [[f64; 3]; 3],
     shift: [f64; 3],
-    /// Range along a straight.
-    range_mm: (f64, f64),
 }
 
 /// A model ready for a walk.
 struct Walk {
     locals: Vec<Local>,
-    views: Vec<View>,
+    /// Of every pass the segments.
+    views: Vec<Vec<View>>,
+    /// Range along each straight.
+    ranges_mm: Vec<(f64, f64)>,
     /// Squares of the distances from the axis between which a point is on the surface beyond doubt.
     on_surface: (f64, f64),
 }
@@ -46,7 +59,7 @@ struct Walk {
 impl<'a> Whole<'a> {
     /// All points, or those with these indices.
     pub fn new(cloud: &'a PointCloud, own: Option<&'a [u32]>) -> Whole<'a> {
-        Whole { cloud, own }
+        Whole { cloud, own, passes: &[] }
     }
 
     /// Number of points.
@@ -66,7 +79,38 @@ impl<'a> Whole<'a> {
     where
         'a: 'b,
     {
-        Whole { cloud: self.cloud, own: Some(indices) }
+        Whole { own: Some(indices), ..*self }
+    }
+
+    /// The same points with each pass where it belongs; none are moved when there are no passes.
+    pub fn moved<'b>(&self, passes: &'b [ScanPass]) -> Whole<'b>
+    where
+        'a: 'b,
+    {
+        Whole { passes, ..*self }
+    }
+
+    /// The passes that points are moved by.
+    pub fn passes(&self) -> &'a [ScanPass] {
+        self.passes
+    }
+
+    /// All that the file holds, the tube's or not.
+    pub fn file_len(&self) -> usize {
+        self.cloud.len()
+    }
+
+    /// One point, where it belongs.
+    fn point(&self, index: u32) -> Point3<f64> {
+        let point = self.cloud.point(index as usize);
+        let pass = self.passes.iter().find(|p| index < p.end);
+        pass.map_or(point, |pass| pass.motion * point)
+    }
+
+    /// At most so many of the points, where they belong, drawn from all of the file.
+    pub fn share(&self, most: usize) -> Vec<Point3<f64>> {
+        let of = |i: usize| self.own.map_or(i as u32, |own| own[i]);
+        drawn(self.len(), most).into_iter().map(|i| self.point(of(i))).collect()
     }
 
     /// Walks all points. Each is given to `add` with its segment and its place in that segment's frame; one `new` per
@@ -78,22 +122,40 @@ impl<'a> Whole<'a> {
         new: impl Fn() -> S + Sync,
         add: impl Fn(&mut S, usize, [f64; 3]) + Sync,
     ) -> Vec<S> {
-        let walk = Walk::new(model, self.cloud.origin(), near_mm);
+        self.walk_passes(model, near_mm, new, |sums, _, segment, place| add(sums, segment, place))
+    }
+
+    /// The same; `add` is told the pass first, 0 where there are none.
+    pub fn walk_passes<S: Send>(
+        &self,
+        model: &TubeModel,
+        near_mm: f64,
+        new: impl Fn() -> S + Sync,
+        add: impl Fn(&mut S, usize, usize, [f64; 3]) + Sync,
+    ) -> Vec<S> {
+        let walk = Walk::new(model, self.cloud.origin(), near_mm, self.passes);
         let chunk = self.len().div_ceil(MOST_CHUNKS).max(CHUNK);
-        let through = |offsets: &mut dyn Iterator<Item = [f32; 3]>| {
-            let (mut sums, mut segment) = (new(), 0);
-            for offset in offsets {
-                let place = walk.find(offset, &mut segment);
-                add(&mut sums, segment, place);
+        let through = |points: &mut dyn Iterator<Item = (u32, [f32; 3])>| {
+            let (mut sums, mut segment, mut pass) = (new(), 0, 0);
+            for (index, offset) in points {
+                while self.passes.get(pass).is_some_and(|p| index >= p.end) && pass + 1 < self.passes.len() {
+                    pass += 1;
+                }
+                let place = walk.find(offset, pass, &mut segment);
+                add(&mut sums, pass, segment, place);
             }
             sums
         };
         let all = self.cloud.offsets();
         match self.own {
-            None => all.par_chunks(chunk).map(|part| through(&mut part.iter().copied())).collect(),
+            None => all
+                .par_chunks(chunk)
+                .enumerate()
+                .map(|(k, part)| through(&mut ((k * chunk) as u32..).zip(part.iter().copied())))
+                .collect(),
             Some(own) => own
                 .par_chunks(chunk)
-                .map(|part| through(&mut part.iter().map(|&i| all[i as usize])))
+                .map(|part| through(&mut part.iter().map(|&i| (i, all[i as usize]))))
                 .collect(),
         }
     }
@@ -152,51 +214,77 @@ impl Data for Whole<'_> {
     }
 }
 
+impl Whole<'_> {
+    /// The sums of each pass by itself.
+    pub fn by_pass(&self, model: &TubeModel, cutoff_mm: f64) -> Vec<Pass> {
+        let locals = prepare(model);
+        let count = self.passes.len().max(1);
+        let new = || (0..count).map(|_| Adder::new(&locals, model, cutoff_mm)).collect::<Vec<_>>();
+        let add = |adders: &mut Vec<Adder>, pass: usize, segment: usize, p: [f64; 3]| {
+            adders[pass].add(segment, p);
+        };
+        let parts = self.walk_passes(model, cutoff_mm, new, add);
+        let finished: Vec<Vec<Pass>> =
+            parts.into_iter().map(|part| part.into_iter().map(Adder::finish).collect()).collect();
+        let of = |pass: usize| Pass::total(locals.len(), finished.iter().map(|part| part[pass].clone()));
+        (0..count).map(of).collect()
+    }
+}
+
 impl Walk {
-    fn new(model: &TubeModel, origin: Point3<f64>, near_mm: f64) -> Walk {
+    fn new(model: &TubeModel, origin: Point3<f64>, near_mm: f64, passes: &[ScanPass]) -> Walk {
         let locals = prepare(model);
         let last = locals.len() - 1;
         let radius = model.tube_radius_mm;
-        let view = |(k, local): (usize, &Local)| {
-            let turn = local.to_local.rotation.to_rotation_matrix();
-            let beyond = |end: bool| if end { BEYOND_RADII * radius } else { 0.0 };
+        let view = |motion: &Frame, local: &Local| {
+            let to_local = local.to_local * motion;
+            let turn = to_local.rotation.to_rotation_matrix();
             View {
                 turn: std::array::from_fn(|row| std::array::from_fn(|column| turn[(row, column)])),
-                shift: (local.to_local * origin).into(),
-                range_mm: (-beyond(k == 0), local.length_mm + beyond(k == last)),
+                shift: (to_local * origin).into(),
             }
         };
-        let views = locals.iter().enumerate().map(view).collect();
+        let of = |motion: &Frame| locals.iter().map(|l| view(motion, l)).collect();
+        let views = match passes {
+            [] => vec![of(&Frame::identity())],
+            passes => passes.iter().map(|p| of(&p.motion)).collect(),
+        };
+        let range = |(k, local): (usize, &Local)| {
+            let beyond = |end: bool| if end { BEYOND_RADII * radius } else { 0.0 };
+            (-beyond(k == 0), local.length_mm + beyond(k == last))
+        };
+        let ranges_mm = locals.iter().enumerate().map(range).collect();
         let on_surface = ((radius - near_mm).max(0.0).powi(2), (radius + near_mm).powi(2));
-        Walk { locals, views, on_surface }
+        Walk { locals, views, ranges_mm, on_surface }
     }
 
     /// Puts the segment that a point faces into `segment`; returns its place there.
-    fn find(&self, offset: [f32; 3], segment: &mut usize) -> [f64; 3] {
+    fn find(&self, offset: [f32; 3], pass: usize, segment: &mut usize) -> [f64; 3] {
         let offset = offset.map(f64::from);
-        let place = self.views[*segment].see(offset);
+        let views = &self.views[pass];
+        let place = views[*segment].see(offset);
         if self.explains(*segment, place) {
             return place;
         }
         let beside = [*segment + 1, segment.wrapping_sub(1)];
-        for k in beside.into_iter().filter(|k| *k < self.views.len()) {
-            let place = self.views[k].see(offset);
+        for k in beside.into_iter().filter(|k| *k < views.len()) {
+            let place = views[k].see(offset);
             if self.explains(k, place) {
                 *segment = k;
                 return place;
             }
         }
-        let distances = self.views.iter().zip(&self.locals).map(|(v, l)| l.square_from_axis(v.see(offset)));
+        let distances = views.iter().zip(&self.locals).map(|(v, l)| l.square_from_axis(v.see(offset)));
         let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
         *segment = nearest.map_or(0, |n| n.0);
-        self.views[*segment].see(offset)
+        views[*segment].see(offset)
     }
 
     /// Whether a point lies on a segment's surface.
     fn explains(&self, segment: usize, p: [f64; 3]) -> bool {
         let square = match &self.locals[segment].arc {
             None => {
-                let (from, to) = self.views[segment].range_mm;
+                let (from, to) = self.ranges_mm[segment];
                 if p[0] < from || p[0] > to {
                     return false;
                 }
