@@ -12,6 +12,7 @@ use super::moments::Sample;
 use super::moves::without_bend;
 use super::outline::solid_start;
 use super::profile;
+use super::realign;
 use super::stretches::correlation;
 use super::structure::{Shown, Structure};
 use super::undecided::{Undecided, widened};
@@ -96,6 +97,9 @@ fn finish_as_chosen(
     }
     // Sigmas by what the points say together, not by their number; what is held was found so already.
     let correlation = correlation(&whole, &best);
+    if whole.passes().len() > 1 {
+        best.information = realign::information(&whole, &best);
+    }
     let information = &best.information / correlation.near;
     let held = profile::tightened(&information, &best.parameters, &chosen.held);
     best.covariance = widened(held, &best.parameters, &chosen.undecided);

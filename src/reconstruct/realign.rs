@@ -5,14 +5,20 @@
 //! Every short stretch of the tube ([section](super::section)) has values of its own, which are eliminated: asked are only
 //! places that several passes saw, and nothing of the tube's shape is taken for drift.
 
+mod blocks;
+mod known;
+
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DMatrix, DVector, Matrix5, Point3, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Cholesky, DVector, Point3, SVector, UnitQuaternion, Vector3};
+
+use blocks::{Blocks, MOTION, Sum};
+pub use known::information;
 
 use super::fit::CUTOFF_SIGMAS;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
-use super::section::{Bins, VALUES, oval_doubt_mm};
+use super::section::{Bins, oval_doubt_mm};
 use super::stripes;
 use super::whole::{ScanPass, Whole};
 use crate::tube::Frame;
@@ -46,13 +52,8 @@ const ARC_OVALITY: f64 = 0.004;
 /// Where a section lies is not known beforehand, in tube radii.
 const ANYWHERE: f64 = 0.3;
 
-/// Shift and turn of a pass.
-const MOTION: usize = 6;
-
-/// Derivatives of a point's residual by its section's values and by its pass's motion, and the residual; products of all.
+/// Derivatives of a point's residual by its section's values and by its pass's motion, and the residual.
 type Row = SVector<f64, 12>;
-type Sum = SMatrix<f64, 12, 12>;
-const RESIDUAL: usize = VALUES + MOTION;
 
 /// What a scan says of its passes.
 struct Asked<'a> {
@@ -68,13 +69,6 @@ struct Asked<'a> {
     reach_mm: f64,
 }
 
-/// The normal equations of the chunks' motions and, last, of the tube's radius; block sums from the first chunk on.
-struct Blocks {
-    chunks: usize,
-    square: DMatrix<f64>,
-    right: DVector<f64>,
-}
-
 /// The passes that a scan was made in and how each must move to lie on the others, of points that scatter by `noise_mm`
 /// about their sections, so many (`correlation`) that say one thing; and by how much the squared residuals fall, over the variance of a point. Empty where nothing says
 /// that there are several.
@@ -84,21 +78,27 @@ pub fn realigned(whole: &Whole, model: &TubeModel, noise_mm: f64, correlation: f
         return (Vec::new(), 0.0);
     }
     let own_mm = (noise_mm * noise_mm - passes_mm * passes_mm).max(0.0).sqrt().max(1e-6);
-    let spine = model.spine();
-    let ends =
-        [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| spine.frame_at(share * spine.length_mm()).translation.vector);
-    let centre = ends.iter().sum::<Vector3<f64>>() / ends.len() as f64;
-    let reach_mm = ends.iter().map(|e| (e - centre).norm()).fold(model.tube_radius_mm, f64::max);
+    let (centre, reach_mm) = middle(model);
     let asked = Asked {
         whole,
         model,
         noise_mm: own_mm,
         cutoff_mm: CUTOFF_SIGMAS * noise_mm,
         spread_mm: MORE_THAN_SEEN * passes_mm.max(noise_mm),
-        centre: centre.into(),
+        centre,
         reach_mm,
     };
     asked.passes().unwrap_or_default()
+}
+
+/// The middle of a tube, and how far it reaches from there.
+fn middle(model: &TubeModel) -> (Point3<f64>, f64) {
+    let spine = model.spine();
+    let place = |share: f64| spine.frame_at(share * spine.length_mm()).translation.vector;
+    let places = [0.0, 0.25, 0.5, 0.75, 1.0].map(place);
+    let centre = places.iter().sum::<Vector3<f64>>() / places.len() as f64;
+    let reach_mm = places.iter().map(|p| (p - centre).norm()).fold(model.tube_radius_mm, f64::max);
+    (centre.into(), reach_mm)
 }
 
 impl Asked<'_> {
@@ -283,92 +283,4 @@ fn finer(coarse: &[usize], found: &[usize]) -> (Vec<usize>, Vec<usize>) {
     edges.dedup();
     let places = found.iter().filter_map(|&b| edges.binary_search(&coarse[b]).ok()).collect();
     (edges, places)
-}
-
-impl Blocks {
-    fn empty(chunks: usize) -> Blocks {
-        let n = MOTION * chunks + 1;
-        Blocks { chunks, square: DMatrix::zeros(n, n), right: DVector::zeros(n) }
-    }
-
-    /// Adds a section: chunk by chunk its sums; its own values, as firm as `stiff`, are eliminated.
-    fn add(&mut self, sums: &BTreeMap<usize, Sum>, stiff: &[f64; VALUES]) {
-        let all: Sum = sums.values().sum();
-        let shared: Matrix5<f64> = all.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
-        let held = shared + Matrix5::from_diagonal(&SVector::from(*stiff));
-        let Some(inverse) = Cholesky::new(held).map(|c| c.inverse()) else { return };
-        let left: SVector<f64, VALUES> = all.fixed_view::<VALUES, 1>(0, RESIDUAL).into_owned();
-        let radius = shared.column(0).into_owned();
-        let last = self.right.len() - 1;
-        self.square[(last, last)] += shared[(0, 0)] - radius.dot(&(inverse * radius));
-        self.right[last] -= left[0] - radius.dot(&(inverse * left));
-        for (c, sum) in sums {
-            let at = MOTION * c;
-            let mixed = sum.fixed_view::<VALUES, MOTION>(0, VALUES);
-            let felt = inverse * mixed;
-            let own = sum.fixed_view::<MOTION, MOTION>(VALUES, VALUES);
-            let mut square = self.square.fixed_view_mut::<MOTION, MOTION>(at, at);
-            square += own;
-            for (other, sum) in sums {
-                let mixed = sum.fixed_view::<VALUES, MOTION>(0, VALUES);
-                let mut square = self.square.fixed_view_mut::<MOTION, MOTION>(at, MOTION * other);
-                square -= felt.transpose() * mixed;
-            }
-            let with_radius = mixed.row(0).transpose() - felt.transpose() * radius;
-            let mut column = self.square.fixed_view_mut::<MOTION, 1>(at, last);
-            column += with_radius;
-            let mut right = self.right.fixed_rows_mut::<MOTION>(at);
-            right -= sum.fixed_view::<MOTION, 1>(VALUES, RESIDUAL) - felt.transpose() * left;
-        }
-    }
-
-    /// Every block with all blocks before it, so that those of consecutive chunks together are a few differences.
-    fn summed(mut self) -> Blocks {
-        let n = MOTION * self.chunks;
-        for at in MOTION..n {
-            self.right[at] += self.right[at - MOTION];
-            for other in 0..n + 1 {
-                self.square[(at, other)] += self.square[(at - MOTION, other)];
-            }
-        }
-        for other in MOTION..n {
-            for at in 0..n {
-                self.square[(at, other)] += self.square[(at, other - MOTION)];
-            }
-        }
-        self
-    }
-
-    /// The equations when all chunks between two boundaries move as one.
-    fn together(&self, boundaries: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
-        let ends: Vec<usize> = boundaries.iter().copied().chain([self.chunks]).collect();
-        let n = MOTION * ends.len() + 1;
-        let last = MOTION * self.chunks;
-        let (mut square, mut right) = (DMatrix::zeros(n, n), DVector::zeros(n));
-        let before = |k: usize| if k == 0 { 0 } else { ends[k - 1] };
-        // Of all chunks before an end, by the last of them.
-        let upto = |end: usize, i: usize| end.checked_sub(1).map(|chunk| MOTION * chunk + i);
-        let sum = |row: Option<usize>, column: Option<usize>| match (row, column) {
-            (Some(row), Some(column)) => self.square[(row, column)],
-            _ => 0.0,
-        };
-        for k in 0..ends.len() {
-            for i in 0..MOTION {
-                let (row, to, from) = (MOTION * k + i, upto(ends[k], i), upto(before(k), i));
-                right[row] = to.map_or(0.0, |r| self.right[r]) - from.map_or(0.0, |r| self.right[r]);
-                for m in 0..ends.len() {
-                    for j in 0..MOTION {
-                        let (until, since) = (upto(ends[m], j), upto(before(m), j));
-                        square[(row, MOTION * m + j)] =
-                            sum(to, until) - sum(from, until) - sum(to, since) + sum(from, since);
-                    }
-                }
-                let with_radius = sum(to, Some(last)) - sum(from, Some(last));
-                (square[(row, n - 1)], square[(n - 1, row)]) = (with_radius, with_radius);
-            }
-        }
-        square[(n - 1, n - 1)] = self.square[(last, last)];
-        right[n - 1] = self.right[last];
-        (square, right)
-    }
 }
