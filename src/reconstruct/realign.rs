@@ -6,11 +6,12 @@
 //! places that several passes saw, and nothing of the tube's shape is taken for drift.
 
 mod blocks;
+mod cut;
 mod known;
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DVector, Point3, SVector, UnitQuaternion, Vector3};
+use nalgebra::{DVector, Point3, SVector, UnitQuaternion, Vector3};
 
 use blocks::{Blocks, MOTION, Sum};
 pub use known::information;
@@ -23,19 +24,15 @@ use super::stripes;
 use super::whole::{ScanPass, Whole};
 use crate::tube::Frame;
 
-/// Points looked at, in runs of so many as they lie in the file.
+/// Points looked at.
 const MOST_POINTS: usize = 50_000;
-const RUN: usize = 200;
 
-/// The file's order is cut into so many chunks; those beside a boundary, once found, into so many again.
+/// The file's order is cut into so many chunks; those beside a boundary, once found, into so many again, so many times at most
+/// and down to chunks of so few points.
 const CHUNKS: usize = 48;
 const FINER: usize = 12;
-
-/// Passes of a scan at most.
-const MOST_PASSES: usize = 16;
-
-/// Times that every boundary is looked for anew beside the others.
-const ROUNDS: usize = 2;
+const LEVELS: usize = 5;
+const FEW_POINTS: usize = 2;
 
 /// A further pass must explain this many times what its six values and its boundary cost.
 const SURELY: f64 = 2.0;
@@ -67,6 +64,27 @@ struct Asked<'a> {
     /// Turns are about here, in units that move a point so far away by a millimetre.
     centre: Point3<f64>,
     reach_mm: f64,
+    bins: Bins,
+}
+
+/// Consecutive points of the file.
+struct Chunk {
+    /// Index of the first.
+    from: u32,
+    /// Points of it that were looked at.
+    points: usize,
+    /// By section.
+    sums: BTreeMap<usize, Sum>,
+}
+
+impl Chunk {
+    /// Adds the chunk that follows.
+    fn add(&mut self, next: Chunk) {
+        self.points += next.points;
+        for (section, sum) in next.sums {
+            *self.sums.entry(section).or_insert_with(Sum::zeros) += sum;
+        }
+    }
 }
 
 /// The passes that a scan was made in and how each must move to lie on the others, of points that scatter by `noise_mm`
@@ -87,6 +105,7 @@ pub fn realigned(whole: &Whole, model: &TubeModel, noise_mm: f64, correlation: f
         spread_mm: MORE_THAN_SEEN * passes_mm.max(noise_mm),
         centre,
         reach_mm,
+        bins: Bins::new(&model.spine(), model.tube_radius_mm, whole.len().min(MOST_POINTS)),
     };
     asked.passes().unwrap_or_default()
 }
@@ -104,90 +123,52 @@ fn middle(model: &TubeModel) -> (Point3<f64>, f64) {
 impl Asked<'_> {
     /// None when there is one pass only.
     fn passes(&self) -> Option<(Vec<ScanPass>, f64)> {
-        let order = self.whole.runs(RUN, MOST_POINTS);
-        let coarse: Vec<usize> = (0..=CHUNKS).map(|k| k * order.len() / CHUNKS).collect();
-        let blocks = self.blocks(&order, &coarse);
-        let price = SURELY * (MOTION as f64 * (order.len() as f64).ln() + 2.0 * (CHUNKS as f64).ln());
-        let found = self.boundaries(&blocks, price)?;
-        let (fine, found) = finer(&coarse, &found);
-        let blocks = self.blocks(&order, &fine);
-        let found = self.needed(&blocks, self.settled(&blocks, found, FINER), price);
-        let (gain, motions) = self.gain(&blocks, &found)?;
-        let ends = found.iter().map(|&b| order[fine[b]]).chain([u32::MAX]);
+        let points = self.whole.within(0, u32::MAX, MOST_POINTS).len() as f64;
+        let price = SURELY * (MOTION as f64 * points.max(2.0).ln() + 2.0 * (CHUNKS as f64).ln());
+        let mut chunks = self.chunks(&[(0, u32::MAX)], CHUNKS);
+        let mut found = cut::boundaries(&self.blocks(&chunks), price)?;
+        for _ in 0..LEVELS {
+            let widest = found.iter().map(|&b| chunks[b].points.max(chunks[b - 1].points)).max();
+            if widest.unwrap_or(0) <= FEW_POINTS {
+                break;
+            }
+            (chunks, found) = self.finer(chunks, &found);
+            let blocks = self.blocks(&chunks);
+            found = cut::needed(&blocks, cut::settled(&blocks, found, FINER), FINER, price);
+        }
+        let (gain, motions) = self.blocks(&chunks).gain(&found)?;
+        let ends = found.iter().map(|&b| chunks[b].from).chain([u32::MAX]);
         let pass = |(k, end): (usize, u32)| ScanPass { end, motion: self.motion(&motions, k) };
         Some((ends.enumerate().map(pass).collect(), gain))
     }
 
-    /// Boundaries added one by one as long as each is worth its price, the best first.
-    fn boundaries(&self, blocks: &Blocks, price: f64) -> Option<Vec<usize>> {
-        let mut found = Vec::new();
-        let (mut gain, _) = self.gain(blocks, &found)?;
-        while found.len() + 1 < MOST_PASSES {
-            let with = |b: usize| {
-                let mut more: Vec<usize> = found.iter().copied().chain([b]).collect();
-                more.sort_unstable();
-                more
-            };
-            let tried = (1..blocks.chunks).filter(|b| !found.contains(b));
-            let tried = tried.filter_map(|b| Some((self.gain(blocks, &with(b))?.0, b)));
-            let Some((best, b)) = tried.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-            let more = self.settled(blocks, with(b), blocks.chunks);
-            let best = self.gain(blocks, &more)?.0.max(best);
-            if best - gain < price {
-                break;
-            }
-            (found, gain) = (more, best);
-        }
-        (!found.is_empty()).then_some(found)
-    }
-
-    /// Every boundary where it is worth the most, no farther from where it was than `reach`.
-    fn settled(&self, blocks: &Blocks, mut found: Vec<usize>, reach: usize) -> Vec<usize> {
-        for _ in 0..ROUNDS {
-            for k in 0..found.len() {
-                let least = found[k].saturating_sub(reach).max(if k > 0 { found[k - 1] + 1 } else { 1 });
-                let most = (found[k] + reach).min(found.get(k + 1).map_or(blocks.chunks, |next| *next) - 1);
-                let at = |b: usize| {
-                    let mut other = found.clone();
-                    other[k] = b;
-                    self.gain(blocks, &other).map(|g| (g.0, b))
-                };
-                let best = (least..=most).filter_map(at).max_by(|a, b| a.0.total_cmp(&b.0));
-                found[k] = best.map_or(found[k], |b| b.1);
+    /// The chunks beside boundaries cut finer, the others between boundaries as one; and where the boundaries are among them.
+    fn finer(&self, chunks: Vec<Chunk>, found: &[usize]) -> (Vec<Chunk>, Vec<usize>) {
+        let mut beside: Vec<usize> = found.iter().flat_map(|&b| [b - 1, b]).collect();
+        beside.dedup();
+        let end = |k: usize| chunks.get(k + 1).map_or(u32::MAX, |next| next.from);
+        let ranges: Vec<(u32, u32)> = beside.iter().map(|&k| (chunks[k].from, end(k))).collect();
+        let boundaries: Vec<u32> = found.iter().map(|&b| chunks[b].from).collect();
+        let mut out: Vec<Chunk> = Vec::new();
+        let mut fine = self.chunks(&ranges, FINER).into_iter().peekable();
+        let mut open = false;
+        for (k, chunk) in chunks.into_iter().enumerate() {
+            if beside.contains(&k) {
+                let next = ranges.iter().find(|r| r.0 == chunk.from).map_or(u32::MAX, |r| r.1);
+                while let Some(part) = fine.next_if(|f| f.from < next) {
+                    out.push(part);
+                }
+                open = false;
+            } else if let Some(last) = out.last_mut().filter(|_| open) {
+                last.add(chunk);
+            } else {
+                out.push(chunk);
+                open = true;
             }
         }
-        found
-    }
-
-    /// The boundaries without those that are not worth their price beside the others: two may have stood for one inside a chunk.
-    fn needed(&self, blocks: &Blocks, mut found: Vec<usize>, price: f64) -> Vec<usize> {
-        while found.len() > 1 {
-            let less = |k: usize| {
-                let mut other = found.clone();
-                other.remove(k);
-                let other = self.settled(blocks, other, FINER);
-                Some((self.gain(blocks, &other)?.0, other))
-            };
-            let best = (0..found.len()).filter_map(less).max_by(|a, b| a.0.total_cmp(&b.0));
-            let all = self.gain(blocks, &found).map_or(0.0, |g| g.0);
-            match best {
-                Some((gain, fewer)) if all - gain < price => found = fewer,
-                _ => break,
-            }
-        }
-        found
-    }
-
-    /// By how much the squared residuals fall, over the noise's variance, when the chunks between boundaries move together; and
-    /// how they move.
-    fn gain(&self, blocks: &Blocks, boundaries: &[usize]) -> Option<(f64, DVector<f64>)> {
-        let (mut square, right) = blocks.together(boundaries);
-        let last = right.len() - 1;
-        let stiffness = (self.noise_mm / self.spread_mm).powi(2);
-        (0..last).for_each(|k| square[(k, k)] += stiffness);
-        square[(last, last)] += 1e-9 * (1.0 + square[(last, last)]);
-        let motions = Cholesky::new(square)?.solve(&right);
-        Some((motions.dot(&right) / (self.noise_mm * self.noise_mm), motions))
+        let place = |from: &u32| out.iter().position(|c| c.from == *from);
+        let found = boundaries.iter().filter_map(place).collect();
+        (out, found)
     }
 
     fn motion(&self, motions: &DVector<f64>, pass: usize) -> Frame {
@@ -198,44 +179,52 @@ impl Asked<'_> {
         Frame::translation(shift.x, shift.y, shift.z) * about
     }
 
-    /// The sums of the chunks of the file's order between `edges`, the sections' values eliminated.
-    fn blocks(&self, order: &[u32], edges: &[usize]) -> Blocks {
-        let chunk = |e: &usize| ScanPass {
-            end: order.get(*e).copied().unwrap_or(u32::MAX),
-            motion: Frame::identity(),
-        };
-        let chunks: Vec<ScanPass> = edges.iter().skip(1).map(chunk).collect();
-        let model = self.model;
-        let spine = model.spine();
-        let bins = Bins::new(&spine, model.tube_radius_mm, order.len());
-        let locals = prepare(model);
-        let starts: Vec<Frame> = spine.segments().iter().map(|s| s.start).collect();
-        let of_chunks = self.whole.only(order);
-        let parts = of_chunks.moved(&chunks).walk_passes(
-            model,
-            self.cutoff_mm,
-            BTreeMap::<(usize, usize), Sum>::new,
-            |sums, chunk, k, p| {
-                let (local, start) = (&locals[k], &starts[k]);
-                if let Some((weight, row)) = self.row(local, start, p) {
-                    let section = bins.of(k, local.share_along(p));
-                    let sum = sums.entry((section, chunk)).or_insert_with(Sum::zeros);
-                    sum.ger(weight, &row, &row, 1.0);
-                }
-            },
-        );
-        let mut sections: Vec<BTreeMap<usize, Sum>> = vec![BTreeMap::new(); bins.total];
-        for ((section, chunk), sum) in parts.into_iter().flatten() {
-            *sections[section].entry(chunk).or_insert_with(Sum::zeros) += sum;
+    /// The sums of each range of the file, cut into so many chunks.
+    fn chunks(&self, ranges: &[(u32, u32)], each: usize) -> Vec<Chunk> {
+        let mut order = Vec::new();
+        let mut chunks: Vec<Chunk> = Vec::new();
+        for &(from, end) in ranges {
+            let points = self.whole.within(from, end, MOST_POINTS);
+            let each = each.min(points.len()).max(1);
+            for k in 0..each {
+                let (at, next) = (k * points.len() / each, (k + 1) * points.len() / each);
+                let from = if k == 0 { from } else { points[at] };
+                chunks.push(Chunk { from, points: next - at, sums: BTreeMap::new() });
+            }
+            order.extend(points);
         }
-        let mut blocks = Blocks::empty(chunks.len());
-        for ((sums, segment), at_mm) in sections.iter().zip(bins.places()).zip(bins.places_mm()) {
-            let radius_mm = model.tube_radius_mm;
+        let end = |k: usize| chunks.get(k + 1).map_or(u32::MAX, |next| next.from);
+        let cuts: Vec<ScanPass> =
+            (0..chunks.len()).map(|k| ScanPass { end: end(k), motion: Frame::identity() }).collect();
+        let locals = prepare(self.model);
+        let starts: Vec<Frame> = self.model.spine().segments().iter().map(|s| s.start).collect();
+        let add = |sums: &mut BTreeMap<(usize, usize), Sum>, chunk: usize, k: usize, p: [f64; 3]| {
+            if let Some((weight, row)) = self.row(&locals[k], &starts[k], p) {
+                let section = self.bins.of(k, locals[k].share_along(p));
+                sums.entry((chunk, section)).or_insert_with(Sum::zeros).ger(weight, &row, &row, 1.0);
+            }
+        };
+        let parts =
+            self.whole.only(&order).moved(&cuts).walk_passes(self.model, self.cutoff_mm, BTreeMap::new, add);
+        for ((chunk, section), sum) in parts.into_iter().flatten() {
+            *chunks[chunk].sums.entry(section).or_insert_with(Sum::zeros) += sum;
+        }
+        chunks
+    }
+
+    /// The equations of the chunks' motions, the sections' values eliminated.
+    fn blocks(&self, chunks: &[Chunk]) -> Blocks {
+        let (model, radius_mm) = (self.model, self.model.tube_radius_mm);
+        let spine = model.spine();
+        let mut blocks = Blocks::empty(chunks.len(), self.noise_mm, self.spread_mm);
+        for (section, (segment, at_mm)) in self.bins.places().zip(self.bins.places_mm()).enumerate() {
             let least = if segment % 2 == 1 { ARC_OVALITY * radius_mm } else { 0.0 };
             let oval_mm = oval_doubt_mm(model, &spine, at_mm).max(least);
             let (own, place) = (OWN_RADIUS * radius_mm, ANYWHERE * radius_mm);
             let stiff = [own, place, place, oval_mm, oval_mm].map(|s| (self.noise_mm / s).powi(2));
-            blocks.add(sums, &stiff);
+            let of = |(k, chunk): (usize, &Chunk)| Some((k, *chunk.sums.get(&section)?));
+            let sums: Vec<(usize, Sum)> = chunks.iter().enumerate().filter_map(of).collect();
+            blocks.add(&sums, &stiff);
         }
         blocks.summed()
     }
@@ -269,18 +258,4 @@ impl Asked<'_> {
         ];
         Some((keep * keep, Row::from(row)))
     }
-}
-
-/// The chunks beside boundaries cut finer, the others between boundaries as one; and where the boundaries are among them.
-fn finer(coarse: &[usize], found: &[usize]) -> (Vec<usize>, Vec<usize>) {
-    let mut edges = vec![coarse[0], coarse[coarse.len() - 1]];
-    for &b in found {
-        for (from, to) in [(coarse[b - 1], coarse[b]), (coarse[b], coarse[b + 1])] {
-            edges.extend((0..=FINER).map(|k| from + k * (to - from) / FINER));
-        }
-    }
-    edges.sort_unstable();
-    edges.dedup();
-    let places = found.iter().filter_map(|&b| edges.binary_search(&coarse[b]).ok()).collect();
-    (edges, places)
 }

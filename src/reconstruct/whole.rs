@@ -19,6 +19,9 @@ use crate::tube::{Frame, Spine};
 /// Chunks at most: their sums take room.
 const MOST_CHUNKS: usize = 64;
 
+/// Points that are taken or left together where not all of a range are.
+const SHORT_RUN: usize = 100;
+
 /// The tube is taken to go on this many radii beyond its first guess of the ends.
 const BEYOND_RADII: f64 = 2.0;
 
@@ -71,6 +74,17 @@ impl<'a> Whole<'a> {
     pub fn runs(&self, run: usize, most: usize) -> Vec<u32> {
         let every = self.len().div_ceil(most).max(1);
         let kept = (0..self.len()).filter(|i| (i / run).is_multiple_of(every));
+        kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+    }
+
+    /// Indices from `from` to before `end` of at most about so many of the points, in runs as they lie in the file.
+    pub fn within(&self, from: u32, end: u32, most: usize) -> Vec<u32> {
+        let (first, behind) = match self.own {
+            None => (from as usize, (end as usize).min(self.cloud.len())),
+            Some(own) => (own.partition_point(|i| *i < from), own.partition_point(|i| *i < end)),
+        };
+        let every = behind.saturating_sub(first).div_ceil(most).max(1);
+        let kept = (first..behind).filter(|i| ((i - first) / SHORT_RUN).is_multiple_of(every));
         kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
     }
 

@@ -2,8 +2,6 @@
 //!
 //! Under `realign`: sums of many small chunks, from which the equations of any few passes follow without the points.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{Cholesky, DMatrix, DVector, Matrix5, SMatrix, SVector};
 
 use super::super::section::VALUES;
@@ -23,18 +21,33 @@ pub struct Blocks {
     pub chunks: usize,
     square: DMatrix<f64>,
     right: DVector<f64>,
+    /// Variance of a point's residual, and over that of a motion's expected millimetres.
+    variance_mm2: f64,
+    stiffness: f64,
 }
 
 impl Blocks {
-    /// No points yet.
-    pub fn empty(chunks: usize) -> Blocks {
+    /// No points yet, of this noise; motions are expected to be about `spread_mm`.
+    pub fn empty(chunks: usize, noise_mm: f64, spread_mm: f64) -> Blocks {
         let n = MOTION * chunks + 1;
-        Blocks { chunks, square: DMatrix::zeros(n, n), right: DVector::zeros(n) }
+        let (variance_mm2, stiffness) = (noise_mm * noise_mm, (noise_mm / spread_mm).powi(2));
+        Blocks { chunks, square: DMatrix::zeros(n, n), right: DVector::zeros(n), variance_mm2, stiffness }
+    }
+
+    /// By how much the squared residuals fall, over the noise's variance, when the chunks between boundaries move together; and
+    /// how they move.
+    pub fn gain(&self, boundaries: &[usize]) -> Option<(f64, DVector<f64>)> {
+        let (mut square, right) = self.together(boundaries);
+        let last = right.len() - 1;
+        (0..last).for_each(|k| square[(k, k)] += self.stiffness);
+        square[(last, last)] += 1e-9 * (1.0 + square[(last, last)]);
+        let motions = Cholesky::new(square)?.solve(&right);
+        Some((motions.dot(&right) / self.variance_mm2, motions))
     }
 
     /// Adds a section: chunk by chunk its sums; its own values, as firm as `stiff`, are eliminated.
-    pub fn add(&mut self, sums: &BTreeMap<usize, Sum>, stiff: &[f64; VALUES]) {
-        let all: Sum = sums.values().sum();
+    pub fn add(&mut self, sums: &[(usize, Sum)], stiff: &[f64; VALUES]) {
+        let all: Sum = sums.iter().map(|(_, sum)| sum).sum();
         let shared: Matrix5<f64> = all.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
         let held = shared + Matrix5::from_diagonal(&SVector::from(*stiff));
         let Some(inverse) = Cholesky::new(held).map(|c| c.inverse()) else { return };
@@ -81,7 +94,7 @@ impl Blocks {
     }
 
     /// The equations when all chunks between two boundaries move as one.
-    pub fn together(&self, boundaries: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
+    fn together(&self, boundaries: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
         let ends: Vec<usize> = boundaries.iter().copied().chain([self.chunks]).collect();
         let n = MOTION * ends.len() + 1;
         let last = MOTION * self.chunks;
