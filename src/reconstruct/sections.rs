@@ -34,6 +34,9 @@ const FIRMNESS: f64 = 1.0;
 /// inside it is an end with its face and its bore (which do less harm).
 const MOST_OUTSIDE: f64 = 0.25;
 const MOST_STRANGERS: f64 = 0.5;
+/// What chance puts outside of three sections, in standard deviations, and a share that does no harm.
+const CHANCE: f64 = 3.5;
+const LEAST_BESET: f64 = 0.05;
 /// So near to an end, in tube radii, and no more than such a share of the end straight, burr, bore and face are among the
 /// points however few they are: a bend would be found there for them.
 const SILENT_RADII: f64 = 0.75;
@@ -145,7 +148,10 @@ impl CentreLine {
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
-        let alone: Vec<bool> = grouped.iter().zip(&fits).map(|(s, f)| !is_crowded(s, f, cutoff)).collect();
+        let strangers: Vec<Strangers> =
+            grouped.iter().zip(&fits).map(|(s, f)| Strangers::among(s, f, cutoff)).collect();
+        let beset = beset(&strangers);
+        let alone: Vec<bool> = strangers.iter().zip(&beset).map(|(s, b)| !s.are_a_crowd() && !b).collect();
         // What crowds one section reaches into the next, in however few points.
         let among = |i: usize| alone[i.saturating_sub(1)..(i + 2).min(alone.len())].iter().all(|a| *a);
         let nowhere_else = Values::zeros();
@@ -415,13 +421,40 @@ fn without_damaged_ends(
     damaged
 }
 
-/// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
-fn is_crowded(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> bool {
-    let off = |s: &Seen| s.residual_mm - s.row().dot(fit);
-    let outside = seen.iter().filter(|s| off(s) > cutoff_mm).count() as f64;
-    let inside = seen.iter().filter(|s| off(s) < -cutoff_mm).count() as f64;
-    let all = seen.len() as f64;
-    outside > MOST_OUTSIDE * all || inside + outside > MOST_STRANGERS * all
+/// Points of a section near the tube's surface, and of them those outside and inside of it.
+struct Strangers {
+    all: f64,
+    outside: f64,
+    inside: f64,
+}
+
+impl Strangers {
+    fn among(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Strangers {
+        let off = |s: &Seen| s.residual_mm - s.row().dot(fit);
+        let outside = seen.iter().filter(|s| off(s) > cutoff_mm).count() as f64;
+        let inside = seen.iter().filter(|s| off(s) < -cutoff_mm).count() as f64;
+        Strangers { all: seen.len() as f64, outside, inside }
+    }
+
+    /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
+    fn are_a_crowd(&self) -> bool {
+        self.outside > MOST_OUTSIDE * self.all || self.outside + self.inside > MOST_STRANGERS * self.all
+    }
+}
+
+/// Where together with both neighbours there are more points outside than chance puts there of what is usual along the tube:
+/// the face of a jaw leaves the tube so flatly that some of its points pass for the tube's.
+fn beset(strangers: &[Strangers]) -> Vec<bool> {
+    let usual = strangers.iter().filter(|s| !s.are_a_crowd());
+    let (outside, all) = usual.fold((0.0, 0.0), |(o, n), s| (o + s.outside, n + s.all));
+    let usual = outside / f64::max(all, 1.0);
+    let around = |i: usize| &strangers[i.saturating_sub(1)..(i + 2).min(strangers.len())];
+    let is_beset = |i: usize| {
+        let (outside, all) = around(i).iter().fold((0.0, 0.0), |(o, n), s| (o + s.outside, n + s.all));
+        let expected = usual * all;
+        outside - expected > (CHANCE * (expected + 1.0).sqrt()).max(LEAST_BESET * all)
+    };
+    (0..strangers.len()).map(is_beset).collect()
 }
 
 /// Robust standard deviation of the points about their sections' fits.
