@@ -6,7 +6,7 @@
 //! hundred times cheaper, and nothing is lost that a small change of the tube could show (the sums are sufficient
 //! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
 
-use nalgebra::{Matrix5, Point3, SMatrix, Vector3, Vector5};
+use nalgebra::{Cholesky, Matrix2, Matrix5, Point3, SMatrix, Vector2, Vector3, Vector5};
 use rayon::prelude::*;
 
 use super::fit::Data;
@@ -48,6 +48,9 @@ const DAMAGED: f64 = 5.0;
 const TUBES_OWN: f64 = 1e-4;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
+
+/// How steeply the tube may lean against the base tube.
+const STEEPEST: f64 = 0.2;
 
 /// Neighbouring sections are taken to follow each other no more than this.
 const MOST_FOLLOWING: f64 = 0.9;
@@ -135,15 +138,16 @@ impl CentreLine {
         let spine = base.spine();
         let bins = Bins::new(&spine, base.tube_radius_mm, points.len());
         let seen = see(points, base, &bins);
-        let grouped = group(seen, bins.total);
+        let mut grouped = group(seen, bins.total);
         let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
         for _ in 0..SHRINKS {
-            fits.par_iter_mut().zip(&grouped).for_each(|(fit, seen)| {
+            fits.par_iter_mut().zip(&mut grouped).for_each(|(fit, seen)| {
                 // Weighing, a section must not swing after a flying point where it sees nothing else: held more firmly
                 // than the noise asks for.
                 *fit = solve(&sums(seen, fit, cutoff), &spreads, FIRMNESS * cutoff);
+                straighten(seen, fit, cutoff, base.tube_radius_mm);
             });
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
@@ -397,6 +401,26 @@ fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
     let near = |straight_mm: f64| (SILENT_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
     let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
     at_mm < near(first_mm) || spine.length_mm() - at_mm < near(base.lra.last_length_mm)
+}
+
+/// Takes out of a section's residuals by how much the tube leans against the base tube there: where a bend is missing its points
+/// would else not lie on one section.
+fn straighten(seen: &mut [Seen], fit: &Values, cutoff_mm: f64, radius_mm: f64) {
+    let middle_mm = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len().max(1) as f64;
+    let row = |s: &Seen| Vector2::new(s.cos, s.sin) * ((s.along_mm - middle_mm) / radius_mm);
+    let stiffness = (FIRMNESS * cutoff_mm / (STEEPEST * radius_mm)).powi(2);
+    let (mut square, mut right) = (Matrix2::identity() * stiffness, Vector2::zeros());
+    for point in seen.iter() {
+        let off = point.residual_mm - point.row().dot(fit);
+        let keep = 1.0 - (off / cutoff_mm).powi(2);
+        if keep > 0.0 {
+            let row = row(point);
+            square += row * row.transpose() * (keep * keep);
+            right += row * (keep * keep * off);
+        }
+    }
+    let slopes = Cholesky::new(square).map_or(Vector2::zeros(), |c| c.solve(&right));
+    seen.iter_mut().for_each(|s| s.residual_mm -= row(s).dot(&slopes));
 }
 
 /// Takes the sections near the ends away that have not the tube's shape, wherever they lie: a burr, a bore, a face is among
