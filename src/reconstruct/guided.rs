@@ -203,7 +203,7 @@ impl Guided {
     fn structure(&self, shown: &Shown) -> Structure {
         let (mut model, noise_mm) = (self.best.model.clone(), self.line.noise_mm);
         if shown.whole.len() > MANY_SAMPLES * shown.sample.len() {
-            let own = shown.sample.iter().filter(|p| !self.line.is_crowded_at(p)).copied().collect();
+            let own = shown.sample.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
             let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
             let effort = Effort { cutoff_mm, rounds: 0, steps: POINT_STEPS, prior: self.prior };
             let mut sample = Sample::new(own, &model);
@@ -212,7 +212,9 @@ impl Guided {
         }
         let (held, prior) = (self.held.clone(), self.prior);
         let correlation = self.correlation;
-        Structure { model, noise_mm, correlation, prior, held, undecided: Vec::new(), decisions: Vec::new() }
+        let (undecided, decisions) = (Vec::new(), Vec::new());
+        let crowded = self.line.crowded().clone();
+        Structure { model, noise_mm, correlation, crowded, prior, held, undecided, decisions }
     }
 
     fn sigma(&self, parameter: Parameter) -> Option<f64> {

@@ -180,8 +180,7 @@ fn by(
     };
     let shown = Shown::new(cloud, &scene, &sample);
     let (mut chosen, mut notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
-    let (passes, gain) =
-        in_pool(|| realign::realigned(&shown.whole, &chosen.model, chosen.noise_mm, chosen.correlation));
+    let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, &chosen));
     let again = in_pool(|| together(&shown, &passes, &chosen.model));
     let shown = Shown { whole: shown.whole.moved(&passes), sample: &again, ..shown };
     if !passes.is_empty() {

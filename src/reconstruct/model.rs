@@ -7,6 +7,7 @@
 use nalgebra::{DVector, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
 use super::moments::{OVALITY, OWN_RADIUS, TUBE_RADIUS};
+use crate::recognize::median;
 use crate::tube::{Frame, Lra, SegmentKind, Spine, wrap_angle};
 
 /// A tube in space.
@@ -123,8 +124,12 @@ impl TubeModel {
         bend.radius_mm * bend.angle_rad >= SHORTEST_OVAL_RADII * self.tube_radius_mm
     }
 
-    /// The model with what is 0 by rule at 0.
+    /// The model with what is 0 by rule at 0, and one CLR where there is to be one: a change may have given a bend its own.
     pub fn settled(mut self) -> TubeModel {
+        let mut radii_mm: Vec<f64> = self.lra.bends.iter().map(|b| b.radius_mm).collect();
+        if let Some(one) = median(&mut radii_mm).filter(|_| self.common_radius) {
+            self.lra.bends.iter_mut().for_each(|b| b.radius_mm = one);
+        }
         for i in 0..self.ovality_mm.len() {
             if !self.may_be_oval(i) {
                 self.ovality_mm[i] = 0.0;

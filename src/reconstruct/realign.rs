@@ -20,7 +20,9 @@ use super::fit::CUTOFF_SIGMAS;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
 use super::section::{Bins, oval_doubt_mm};
+use super::sections::Crowded;
 use super::stripes;
+use super::structure::Structure;
 use super::whole::{ScanPass, Whole};
 use crate::tube::Frame;
 
@@ -65,6 +67,7 @@ struct Asked<'a> {
     centre: Point3<f64>,
     reach_mm: f64,
     bins: Bins,
+    crowded: &'a Crowded,
 }
 
 /// Consecutive points of the file.
@@ -87,12 +90,13 @@ impl Chunk {
     }
 }
 
-/// The passes that a scan was made in and how each must move to lie on the others, of points that scatter by `noise_mm`
-/// about their sections, so many (`correlation`) that say one thing; and by how much the squared residuals fall, over the variance of a point. Empty where nothing says
-/// that there are several.
-pub fn realigned(whole: &Whole, model: &TubeModel, noise_mm: f64, correlation: f64) -> (Vec<ScanPass>, f64) {
+/// The passes that a scan was made in and how each must move to lie on the others, of a tube whose structure is about known;
+/// and by how much the squared residuals fall, over the variance of a point. Empty where nothing says that there are several.
+pub fn realigned(whole: &Whole, chosen: &Structure) -> (Vec<ScanPass>, f64) {
+    let Structure { model, noise_mm, correlation, .. } = chosen;
+    let noise_mm = *noise_mm;
     let passes_mm = stripes::disagreement_mm(whole, model, noise_mm);
-    if passes_mm <= 0.0 && correlation < STRUCTURED {
+    if passes_mm <= 0.0 && *correlation < STRUCTURED {
         return (Vec::new(), 0.0);
     }
     let own_mm = (noise_mm * noise_mm - passes_mm * passes_mm).max(0.0).sqrt().max(1e-6);
@@ -106,6 +110,7 @@ pub fn realigned(whole: &Whole, model: &TubeModel, noise_mm: f64, correlation: f
         centre,
         reach_mm,
         bins: Bins::new(&model.spine(), model.tube_radius_mm, whole.len().min(MOST_POINTS)),
+        crowded: &chosen.crowded,
     };
     asked.passes().unwrap_or_default()
 }
@@ -236,11 +241,15 @@ impl Asked<'_> {
         if keep <= 0.0 {
             return None;
         }
+        let place = start * Point3::from(p);
+        if self.crowded.holds(&place) {
+            return None;
+        }
         let (u, v) = local.across(p);
         let size = u.hypot(v).max(1e-12);
         let (c, s) = (u / size, v / size);
         let normal = start.rotation * local.outward(p);
-        let arm = (start * Point3::from(p) - self.centre) / self.reach_mm;
+        let arm = (place - self.centre) / self.reach_mm;
         let lever = arm.cross(&normal);
         let row = [
             -1.0,

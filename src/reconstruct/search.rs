@@ -47,6 +47,9 @@ const EXPLAINED: f64 = 0.05;
 /// were none moved it by 1.1 to 2.7 times that, true ones by 3 and more.
 pub(super) const ABOVE_PASSES: f64 = 2.75;
 
+/// A tube's stock is no straighter than this, in tube radii.
+const STRAIGHT_RADII: f64 = 0.005;
+
 /// One that explains more than so many bends' price is none of the passes' making.
 const DEAREST_NONE: f64 = 3.0;
 
@@ -258,21 +261,21 @@ impl Jury {
         (0..best.bends()).map(|i| self.angle_worth(best, &solved, i) < UNSURE.powi(2)).collect()
     }
 
-    /// The tube without the bends that move it by no more than its scan's passes disagree.
+    /// The tube without the bends that move it by no more than its scan's passes disagree, or than its noise where that is a
+    /// small part of the tube: no stock is straighter, and what the model leaves out shows no less.
     pub(super) fn material(&mut self, mut best: Candidate, passes_mm: f64) -> Candidate {
-        if passes_mm <= 0.0 {
-            return best;
-        }
+        let noise_mm = self.line.noise_mm.min(STRAIGHT_RADII * best.model.tube_radius_mm);
+        let least_mm = noise_mm.max(ABOVE_PASSES * passes_mm);
         loop {
             let dearest = best.score + DEAREST_NONE * self.price(5, 1);
             let fewer = self.changes(&best).into_iter().filter(|c| c.model.lra.bends.len() < best.bends());
             let fitted = fewer.map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
-            let none = fitted.filter(|(c, _)| {
-                c.score < dearest && self.line.apart_mm(&best.model, &c.model) < ABOVE_PASSES * passes_mm
-            });
+            let none = fitted
+                .filter(|(c, _)| c.score < dearest && self.line.apart_mm(&best.model, &c.model) < least_mm);
             let Some((less, what)) = none.min_by(|a, b| a.0.score.total_cmp(&b.0.score)) else { return best };
-            let um = 1e3 * passes_mm;
-            let what = format!("{what}: it moves the tube by no more than the passes disagree ({um:.0} um)");
+            let um = 1e3 * least_mm;
+            let what =
+                format!("{what}: it moves the tube by less than {um:.0} um, no more than the scan shows");
             self.decide(what, None, best.score - less.score, true);
             best = less;
         }

@@ -74,6 +74,21 @@ pub struct Section {
     least: f64,
 }
 
+/// Where something else was scanned with the tube.
+#[derive(Debug, Clone, Default)]
+pub struct Crowded {
+    places: Vec<Point3<f64>>,
+    /// How far around each.
+    reach_mm: f64,
+}
+
+impl Crowded {
+    /// Whether a point lies there.
+    pub fn holds(&self, p: &Point3<f64>) -> bool {
+        self.places.iter().any(|c| (p - c).norm_squared() < self.reach_mm * self.reach_mm)
+    }
+}
+
 /// Sections in order along the tube.
 #[derive(Debug, Clone)]
 pub struct CentreLine {
@@ -84,9 +99,8 @@ pub struct CentreLine {
     pub noise_mm: f64,
     /// Weight of all points.
     pub count: f64,
-    /// Where sections were left out because something else was scanned there, and how far around.
-    crowded: Vec<Point3<f64>>,
-    reach_mm: f64,
+    /// Where sections were left out because something else was scanned there.
+    crowded: Crowded,
 }
 
 /// A point as its section sees it.
@@ -128,8 +142,8 @@ impl CentreLine {
         };
         let sections: Vec<Section> = (0..polygon.len()).map(section).collect();
         let count = sections.len() as f64;
-        let (crowded, reach_mm) = (Vec::new(), 0.0);
-        CentreLine { sections, radius_mm, noise_mm: 0.01 * radius_mm, count, crowded, reach_mm }
+        let crowded = Crowded::default();
+        CentreLine { sections, radius_mm, noise_mm: 0.01 * radius_mm, count, crowded }
     }
 
     /// Measures the sections of a tube that lies near `base`: one that the polygon gave, or one that was fitted.
@@ -159,7 +173,7 @@ impl CentreLine {
         // What crowds one section reaches into the next, in however few points.
         let among = |i: usize| alone[i.saturating_sub(1)..(i + 2).min(alone.len())].iter().all(|a| *a);
         let nowhere_else = Values::zeros();
-        let (mut sections, mut crowded) = (Vec::new(), Vec::new());
+        let (mut sections, mut places) = (Vec::new(), Vec::new());
         for (i, ((place, seen), fit)) in bins.places().zip(&grouped).zip(&fits).enumerate() {
             // So few points lie on some section or other, a flying one among them too: that of the base tells which.
             let few = fitted && (seen.len() as f64) < JUDGED_POINTS;
@@ -174,7 +188,7 @@ impl CentreLine {
             // Before the first fit the radius is a guess: all points may look like strangers.
             let at_mm = segment.start_mm + along;
             if fitted && (is_at_an_end(base, &spine, at_mm) || !among(i)) {
-                crowded.push(frame.translation.vector.into());
+                places.push(frame.translation.vector.into());
                 continue;
             }
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
@@ -193,16 +207,16 @@ impl CentreLine {
         }
         if fitted {
             let ends = without_damaged_ends(&mut sections, base, &spine, noise);
-            crowded.extend(ends);
+            places.extend(ends);
         }
         let count = sections.iter().map(|s| s.count).sum();
-        let reach_mm = base.tube_radius_mm.hypot(0.5 * bins.length_mm);
-        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded, reach_mm }
+        let crowded = Crowded { places, reach_mm: base.tube_radius_mm.hypot(0.5 * bins.length_mm) };
+        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded }
     }
 
-    /// Whether a point lies where something else was scanned with the tube.
-    pub fn is_crowded_at(&self, p: &Point3<f64>) -> bool {
-        self.crowded.iter().any(|c| (p - c).norm_squared() < self.reach_mm * self.reach_mm)
+    /// Where it tells nothing because something else was scanned there.
+    pub fn crowded(&self) -> &Crowded {
+        &self.crowded
     }
 
     /// The farthest that two tubes lie apart across the centre line.

@@ -19,7 +19,7 @@ const RUN: usize = 1000;
 /// Fewer pairs tell nothing.
 const LEAST_PAIRS: usize = 500;
 /// A share of the variance that is within the error of both estimates.
-const LEAST_SHARE: f64 = 0.1;
+const LEAST_SHARE: f64 = 0.05;
 
 /// Neighbours so far.
 #[derive(Default)]

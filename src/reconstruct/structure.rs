@@ -17,7 +17,7 @@ use super::profile::{Held, lengths};
 use super::reach::reaching;
 use super::scene::Scene;
 use super::search::{Candidate, DOUBT, FULL_STEPS, Jury};
-use super::sections::CentreLine;
+use super::sections::{CentreLine, Crowded};
 use super::simplify::simplify;
 use super::stripes;
 use super::undecided::{self, Undecided};
@@ -84,6 +84,8 @@ pub struct Structure {
     pub noise_mm: f64,
     /// How many points say one thing.
     pub correlation: f64,
+    /// Where something else was scanned with the tube.
+    pub crowded: Crowded,
     /// Expectation of the bend radii that it was fitted with.
     pub prior: Option<RadiusPrior>,
     /// What the linear covariance overstates.
@@ -193,14 +195,14 @@ impl Jury {
         let held = lengths(&self.line, &model, self.correlation, self.prior);
         let (noise_mm, prior, decisions) = (self.line.noise_mm, self.prior, self.decisions);
         let undecided = undecided::of(self.undecided, &model);
-        let correlation = self.correlation;
-        Structure { noise_mm, correlation, prior, held, undecided, decisions, model }
+        let (correlation, crowded) = (self.correlation, self.line.crowded().clone());
+        Structure { noise_mm, correlation, crowded, prior, held, undecided, decisions, model }
     }
 
     /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
     /// points may have taken some that are not the tube's for its own.
     fn confirmed(mut self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
-        let sample = sample.iter().filter(|p| !self.line.is_crowded_at(p)).copied().collect();
+        let sample = sample.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
         let mut sample = Sample::new(sample, &model);
         let (mut best, mut score) = self.fit_points(&mut sample, &model);
         loop {
