@@ -50,7 +50,7 @@ fn stages(criterion: &mut Criterion, points: usize) -> anyhow::Result<()> {
     group.bench_function(id("read"), |b| b.iter(|| read_scan(&path, Unit::Millimetre)));
     group.bench_function(id("scene"), |b| b.iter(|| scene::look(&cloud, None)));
     group.bench_function(id("structure"), |b| b.iter(choose));
-    group.bench_function(id("finish"), |b| b.iter(|| finish(&cloud, seen.clone(), thin.clone(), &chosen)));
+    group.bench_function(id("finish"), |b| b.iter(|| finish(&shown, &seen.warnings, &chosen)));
     group.bench_function(id("reconstruct"), |b| b.iter(|| reconstruct(&cloud, &Options::default())));
     group.bench_function(id("file to table"), |b| b.iter(|| measure(&path, Unit::Millimetre, None)));
     group.finish();

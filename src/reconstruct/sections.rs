@@ -153,15 +153,20 @@ impl CentreLine {
         let bins = Bins::new(&spine, base.tube_radius_mm, points.len());
         let seen = see(points, base, &bins);
         let mut grouped = group(seen, bins.total);
+        // Near an end burr, bore and face lean, not the tube.
+        let near_mm = DAMAGED_RADII * base.tube_radius_mm;
+        let inside: Vec<bool> = bins.places_mm().map(|at| at.min(spine.length_mm() - at) > near_mm).collect();
         let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
         for _ in 0..SHRINKS {
-            fits.par_iter_mut().zip(&mut grouped).for_each(|(fit, seen)| {
+            fits.par_iter_mut().zip(&mut grouped).zip(&inside).for_each(|((fit, seen), inside)| {
                 // Weighing, a section must not swing after a flying point where it sees nothing else: held more firmly
                 // than the noise asks for.
                 *fit = solve(&sums(seen, fit, cutoff), &spreads, FIRMNESS * cutoff);
-                straighten(seen, fit, cutoff, base.tube_radius_mm);
+                if *inside {
+                    straighten(seen, fit, cutoff, base.tube_radius_mm);
+                }
             });
             noise = scatter(&grouped, &fits, cutoff).max(1e-6);
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
