@@ -104,7 +104,9 @@ fn finish_as_chosen(
     let held = profile::tightened(&information, &best.parameters, &chosen.held);
     best.covariance = widened(held, &best.parameters, &chosen.undecided);
     let ends = end_points(&whole, shown.sample, &best);
-    let mut measured = measure::measure(&mut best, ends, (correlation.along_arc / correlation.near).sqrt());
+    let moved_mm = realign::moved_mm(whole.passes(), &best.model);
+    let radius_doubt = (correlation.along_arc / correlation.near).sqrt();
+    let mut measured = measure::measure(&mut best, ends, radius_doubt, moved_mm);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });

@@ -42,9 +42,14 @@ pub(super) struct Values {
 }
 
 /// Sets the end straights' lengths from the points of both [ends](super::whole::Whole::ends) and puts sigmas beside all
-/// values; the radii's are `radius_doubt` times what the covariance says.
-pub fn measure(fit: &mut Fit, end_points: [Vec<Point3<f64>>; 2], radius_doubt: f64) -> MeasuredTube {
-    let Scanned { ends, first, last } = set_ends(fit, end_points);
+/// values; the radii's are `radius_doubt` times what the covariance says. The scan's passes were moved by about `moved_mm`.
+pub fn measure(
+    fit: &mut Fit,
+    end_points: [Vec<Point3<f64>>; 2],
+    radius_doubt: f64,
+    moved_mm: f64,
+) -> MeasuredTube {
+    let Scanned { ends, first, last } = set_ends(fit, end_points, moved_mm);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
     let jacobian = jacobian(&fit.model, &fit.parameters, &ends);
@@ -210,10 +215,11 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, [first_points, last_points]: [Vec<Point3<f64>>; 2]) -> Scanned {
+fn set_ends(fit: &mut Fit, [first_points, last_points]: [Vec<Point3<f64>>; 2], moved_mm: f64) -> Scanned {
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
     let [first_frame, last_frame] = end_frames(&fit.model.spine());
-    let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise);
+    // Along the tube passes are known to lie on each other no better than they did across it before.
+    let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise).max(moved_mm);
     let (first, last) = rayon::join(
         || ends::find(first_points, radius, noise, passes_mm),
         || ends::find(last_points, radius, noise, passes_mm),

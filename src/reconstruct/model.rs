@@ -121,7 +121,12 @@ impl TubeModel {
     /// Whether a bend is long enough for an oval section; where it is not its ovality is no free value, and 0 by rule.
     pub fn may_be_oval(&self, i: usize) -> bool {
         let bend = &self.lra.bends[i];
-        bend.radius_mm * bend.angle_rad >= SHORTEST_OVAL_RADII * self.tube_radius_mm
+        self.is_arc_oval(bend.radius_mm * bend.angle_rad)
+    }
+
+    /// The same of an arc of some length.
+    pub fn is_arc_oval(&self, length_mm: f64) -> bool {
+        length_mm >= SHORTEST_OVAL_RADII * self.tube_radius_mm
     }
 
     /// The model with what is 0 by rule at 0, and one CLR where there is to be one: a change may have given a bend its own.

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DVector, Point3, SVector, UnitQuaternion, Vector3};
 
 use blocks::{Blocks, MOTION, Sum};
-pub use known::information;
+pub use known::{information, moved_mm};
 
 use super::fit::CUTOFF_SIGMAS;
 use super::local::{Local, prepare};

@@ -31,7 +31,7 @@ const OVAL_DOUBT: f64 = 1e-5;
 const OVAL_DOUBT_SHARE: f64 = 0.15;
 const OVAL_DOUBT_RADII: f64 = 1.2;
 /// How oval a bend may be that is too short to tell, in tube radii; sections that lie on it hardly reach beyond it by this.
-const OVAL_UNTOLD: f64 = 0.02;
+pub const OVAL_UNTOLD: f64 = 0.02;
 const OVAL_UNTOLD_RADII: f64 = 0.25;
 
 /// Fewest points that judge a section, and the median of chi-squared with five degrees of freedom.

@@ -13,9 +13,10 @@ use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
+use super::moves::mean_radius_mm;
 use super::section::{
-    Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
-    solve,
+    Bins, JUDGED_POINTS, MEDIAN_CHI2, OVAL_UNTOLD, SPREADS, Sums, VALUES, Values, cost, doubt_ovality,
+    oval_doubt_mm, solve,
 };
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
 use crate::tube::{Spine, any_normal};
@@ -192,7 +193,12 @@ impl CentreLine {
             let frame = segment.frame_at(along);
             // Before the first fit the radius is a guess: all points may look like strangers.
             let at_mm = segment.start_mm + along;
-            if fitted && (is_at_an_end(base, &spine, at_mm) || !among(i)) {
+            let silent = || {
+                is_at_an_end(base, &spine, at_mm)
+                    || !among(i)
+                    || is_oval_untold(base, &spine, (at_mm, bins.length_mm), cutoff)
+            };
+            if fitted && silent() {
                 places.push(frame.translation.vector.into());
                 continue;
             }
@@ -413,6 +419,22 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
         }
     }
     Sums::from(sums)
+}
+
+/// Whether a section holds a bend too short for an ovality of its own, on a tube so thick that its points would not lie on any
+/// one section: those left would lean to one side.
+fn is_oval_untold(base: &TubeModel, spine: &Spine, (at_mm, length_mm): (f64, f64), cutoff_mm: f64) -> bool {
+    // Bends so short do not know their own CLR.
+    let usual = mean_radius_mm(base).unwrap_or(0.0);
+    let bends = base.lra.bends.iter().enumerate();
+    let short =
+        bends.filter(|(_, b)| !base.is_arc_oval(b.angle_rad * b.radius_mm.min(usual))).map(|(i, _)| i);
+    let holds = |i: usize| {
+        let arc = &spine.segments()[2 * i + 1];
+        let half = 0.5 * length_mm;
+        (arc.start_mm - half..arc.start_mm + arc.length_mm + half).contains(&at_mm)
+    };
+    OVAL_UNTOLD * base.tube_radius_mm > cutoff_mm && { short }.any(holds)
 }
 
 /// Whether a place is where the end of the tube is seen.

@@ -55,14 +55,19 @@ pub fn information(whole: &Whole, fit: &Fit) -> DMatrix<f64> {
 /// How firmly a pass is held where it lies, for shifts and turns of the tube's pose: by how far the passes were moved.
 fn firmness(passes: &[ScanPass], model: &TubeModel, least_mm: f64) -> Matrix6<f64> {
     let (centre, reach_mm) = middle(model);
-    let count = passes.len().max(1) as f64;
-    let moved = passes.iter().map(|p| p.motion * centre - centre);
-    let mean = moved.clone().sum::<Vector3<f64>>() / count;
-    let square = moved.map(|m| (m - mean).norm_squared()).sum::<f64>() / (3.0 * count);
-    let spread_mm = square.sqrt().max(least_mm);
+    let spread_mm = moved_mm(passes, model).max(least_mm);
     let arm = (model.start.inverse() * centre).coords;
     let mut motion = Matrix6::identity();
     motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm.cross_matrix());
     motion.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() * reach_mm));
     motion.transpose() * motion / (spread_mm * spread_mm)
+}
+
+/// By how much passes were moved against each other in the middle of the tube: one standard deviation along each axis.
+pub fn moved_mm(passes: &[ScanPass], model: &TubeModel) -> f64 {
+    let (centre, _) = middle(model);
+    let count = passes.len().max(1) as f64;
+    let moved = passes.iter().map(|p| p.motion * centre - centre);
+    let mean = moved.clone().sum::<Vector3<f64>>() / count;
+    (moved.map(|m| (m - mean).norm_squared()).sum::<f64>() / (3.0 * count)).sqrt()
 }
