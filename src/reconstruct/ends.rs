@@ -17,7 +17,7 @@ const STEEPEST_FACES: [f64; 2] = [0.1228, MOST_OBLIQUE];
 const MAX_CUT_SIGMA_RAD: f64 = std::f64::consts::PI / 180.0;
 /// Share of the sectors around the tube that must end together.
 const LEAST_AGREEING: f64 = 0.6;
-/// Points this far from the outside, in standard deviations of the noise, show where it stops. Few are within it, where
+/// Points this far from the outside, in standard deviations of noise and passes, show where it stops. Few are within it, where
 /// the face's rim would pile up.
 const OUTSIDE_SIGMAS: std::ops::Range<f64> = -1.0..3.5;
 /// An outline is no sharper than this share of the noise: the rim of a face that does not show by itself blurs it.
@@ -77,7 +77,8 @@ pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_
     let inner: Vec<Point3<f64>> =
         points.iter().filter(|p| face::may_hold(p, radius_mm, noise_mm)).copied().collect();
     // Nearly all of the points, so they are not copied.
-    points.retain(|p| OUTSIDE_SIGMAS.contains(&((p.y.hypot(p.z) - radius_mm) / noise_mm)));
+    let scatter_mm = noise_mm.hypot(passes_mm);
+    points.retain(|p| OUTSIDE_SIGMAS.contains(&((p.y.hypot(p.z) - radius_mm) / scatter_mm)));
     let surface = points;
     let outline = outline::find(&surface, radius_mm, noise_mm, passes_mm)?;
     let near_mm = DIFFERENT_SIGMAS * outline.sigma_mm + outline.step_mm.max(3.0 * noise_mm);
