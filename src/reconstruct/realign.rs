@@ -36,6 +36,9 @@ const FINER: usize = 12;
 const LEVELS: usize = 5;
 const FEW_POINTS: usize = 2;
 
+/// So much less may a boundary explain where the scan jumps than where it explains the most.
+const MUCH: f64 = 50.0;
+
 /// A further pass must explain this many times what its six values and its boundary cost.
 const SURELY: f64 = 2.0;
 
@@ -81,6 +84,11 @@ struct Chunk {
 }
 
 impl Chunk {
+    /// Nothing yet, from an index on.
+    fn from(from: u32) -> Chunk {
+        Chunk { from, points: 0, sums: BTreeMap::new() }
+    }
+
     /// Adds the chunk that follows.
     fn add(&mut self, next: Chunk) {
         self.points += next.points;
@@ -141,10 +149,45 @@ impl Asked<'_> {
             let blocks = self.blocks(&chunks);
             found = cut::needed(&blocks, cut::settled(&blocks, found, FINER), FINER, price);
         }
-        let (gain, motions) = self.blocks(&chunks).gain(&found)?;
-        let ends = found.iter().map(|&b| chunks[b].from).chain([u32::MAX]);
+        let likeliest: Vec<u32> = found.iter().map(|&b| chunks[b].from).collect();
+        let jumps: Vec<u32> = likeliest.iter().map(|&b| self.jump_near(b)).collect();
+        let (ends, gain, motions) = self.at_jumps(likeliest, &jumps)?;
+        let ends = ends.into_iter().chain([u32::MAX]);
         let pass = |(k, end): (usize, u32)| ScanPass { end, motion: self.motion(&motions, k) };
         Some((ends.enumerate().map(pass).collect(), gain))
+    }
+
+    /// Index of the point, of those about an index, that is the farthest from the one before it: there the next pass began.
+    fn jump_near(&self, index: u32) -> u32 {
+        let near = self.whole.around(index, self.whole.len() / (2 * CHUNKS));
+        let places: Vec<Point3<f64>> = near.iter().map(|&i| self.whole.point(i)).collect();
+        let jumps = places.windows(2).map(|w| (w[1] - w[0]).norm_squared()).zip(&near[1..]);
+        jumps.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(index, |(_, i)| *i)
+    }
+
+    /// Each boundary at the jump near it, unless much speaks against that: the last points of a pass may lie where nothing tells
+    /// how it moved. With the gain and the motions then.
+    fn at_jumps(&self, likeliest: Vec<u32>, jumps: &[u32]) -> Option<(Vec<u32>, f64, DVector<f64>)> {
+        let mut cuts: Vec<u32> = likeliest.iter().chain(jumps).copied().chain([0]).collect();
+        cuts.sort_unstable();
+        cuts.dedup();
+        let place = |index: &u32| cuts.binary_search(index).unwrap_or(0);
+        let mut chunks: Vec<Chunk> = cuts.iter().map(|&from| Chunk::from(from)).collect();
+        self.sum_up(&mut chunks, &self.whole.within(0, u32::MAX, MOST_POINTS));
+        let blocks = self.blocks(&chunks);
+        let mut found: Vec<usize> = likeliest.iter().map(place).collect();
+        let (mut gain, mut motions) = blocks.gain(&found)?;
+        for (k, jump) in jumps.iter().enumerate() {
+            let mut other = found.clone();
+            other[k] = place(jump);
+            let is_order = other.windows(2).all(|w| w[0] < w[1]) && other[0] > 0;
+            let at_jump = blocks.gain(&other).filter(|g| is_order && g.0 > gain - MUCH);
+            if let Some(at_jump) = at_jump {
+                found = other;
+                (gain, motions) = at_jump;
+            }
+        }
+        Some((found.into_iter().map(|b| cuts[b]).collect(), gain, motions))
     }
 
     /// The chunks beside boundaries cut finer, the others between boundaries as one; and where the boundaries are among them.
@@ -194,10 +237,16 @@ impl Asked<'_> {
             for k in 0..each {
                 let (at, next) = (k * points.len() / each, (k + 1) * points.len() / each);
                 let from = if k == 0 { from } else { points[at] };
-                chunks.push(Chunk { from, points: next - at, sums: BTreeMap::new() });
+                chunks.push(Chunk { points: next - at, ..Chunk::from(from) });
             }
             order.extend(points);
         }
+        self.sum_up(&mut chunks, &order);
+        chunks
+    }
+
+    /// Sums points of the file, in its order, into the chunks that they are of.
+    fn sum_up(&self, chunks: &mut [Chunk], order: &[u32]) {
         let end = |k: usize| chunks.get(k + 1).map_or(u32::MAX, |next| next.from);
         let cuts: Vec<ScanPass> =
             (0..chunks.len()).map(|k| ScanPass { end: end(k), motion: Frame::identity() }).collect();
@@ -210,11 +259,10 @@ impl Asked<'_> {
             }
         };
         let parts =
-            self.whole.only(&order).moved(&cuts).walk_passes(self.model, self.cutoff_mm, BTreeMap::new, add);
+            self.whole.only(order).moved(&cuts).walk_passes(self.model, self.cutoff_mm, BTreeMap::new, add);
         for ((chunk, section), sum) in parts.into_iter().flatten() {
             *chunks[chunk].sums.entry(section).or_insert_with(Sum::zeros) += sum;
         }
-        chunks
     }
 
     /// The equations of the chunks' motions, the sections' values eliminated.

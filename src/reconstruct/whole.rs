@@ -88,6 +88,13 @@ impl<'a> Whole<'a> {
         kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
     }
 
+    /// Indices of the points about one, `reach` to either side.
+    pub fn around(&self, index: u32, reach: usize) -> Vec<u32> {
+        let at = self.own.map_or(index as usize, |own| own.partition_point(|i| *i < index));
+        let range = at.saturating_sub(reach)..(at + reach).min(self.len());
+        range.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+    }
+
     /// Those of the cloud's points that have these indices.
     pub fn only<'b>(&self, indices: &'b [u32]) -> Whole<'b>
     where
@@ -115,7 +122,7 @@ impl<'a> Whole<'a> {
     }
 
     /// One point, where it belongs.
-    fn point(&self, index: u32) -> Point3<f64> {
+    pub fn point(&self, index: u32) -> Point3<f64> {
         let point = self.cloud.point(index as usize);
         let pass = self.passes.iter().find(|p| index < p.end);
         pass.map_or(point, |pass| pass.motion * point)
