@@ -35,6 +35,8 @@ const FIRMNESS: f64 = 1.0;
 /// inside it is an end with its face and its bore (which do less harm).
 const MOST_OUTSIDE: f64 = 0.25;
 const MOST_STRANGERS: f64 = 0.5;
+/// With this share of strangers the points may not be those of one section.
+const SEVERAL: f64 = 0.08;
 /// What chance puts outside of three sections, in standard deviations, and a share that does no harm.
 const CHANCE: f64 = 3.5;
 const LEAST_BESET: f64 = 0.05;
@@ -196,7 +198,8 @@ impl CentreLine {
             let silent = || {
                 is_at_an_end(base, &spine, at_mm)
                     || !among(i)
-                    || is_oval_untold(base, &spine, (at_mm, bins.length_mm), cutoff)
+                    || (strangers[i].are_several()
+                        && is_oval_untold(base, &spine, (at_mm, bins.length_mm), cutoff))
             };
             if fitted && silent() {
                 places.push(frame.translation.vector.into());
@@ -504,6 +507,11 @@ impl Strangers {
     /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
     fn are_a_crowd(&self) -> bool {
         self.outside > MOST_OUTSIDE * self.all || self.outside + self.inside > MOST_STRANGERS * self.all
+    }
+
+    /// Whether so many points miss the section that it may be none.
+    fn are_several(&self) -> bool {
+        self.outside + self.inside > SEVERAL * self.all
     }
 }
 
