@@ -3,8 +3,8 @@
 //! Between `cloud` and `inspect`. The way of paper 000, stage by stage: the tube among what lies around it ([`scene`]: a
 //! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, those that
 //! `follow` one another joined by [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs
-//! ([`arcline`], [`apollonius`]), how many bends ([`structure`], by `search` on the centre line measured in `sections`), least
-//! squares on all points, ends and sigmas ([`finish`]). Both fits descend by `fit` on normal equations that `normal` assembles from a moment per segment.
+//! ([`arcline`], [`apollonius`]), how many bends ([`structure`], by `search` on the centre line measured in `sections`; once
+//! more where `realign` finds that the scan's passes disagree), least squares on all points, ends and sigmas ([`finish`]). Both fits descend by `fit` on normal equations that `normal` assembles from a moment per segment.
 
 pub mod apollonius;
 pub mod arcline;

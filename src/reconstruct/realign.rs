@@ -316,3 +316,69 @@ impl Asked<'_> {
         Some((keep * keep, Row::from(row)))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud::PointCloud;
+    use crate::tube::Lra;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
+
+    const RADIUS: f64 = 10.0;
+    const NOISE: f64 = 0.03;
+
+    /// A straight tube of 200 mm in stripes, scanned once from each side; the second pass lies off by `drift`.
+    fn two_passes(drift: &Frame) -> Vec<Point3<f64>> {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut points = Vec::new();
+        for (side, motion) in [(0.0, Frame::identity()), (2.0, *drift)] {
+            for stripe in 0..160 {
+                for k in 0..50 {
+                    let turn = side - 1.4 + 0.056 * f64::from(k);
+                    let r = RADIUS + NOISE * rng.sample::<f64, _>(StandardNormal);
+                    points
+                        .push(motion * Point3::new(1.25 * f64::from(stripe), r * turn.cos(), r * turn.sin()));
+                }
+            }
+        }
+        points
+    }
+
+    fn found(points: &[Point3<f64>]) -> Vec<ScanPass> {
+        let cloud = PointCloud::from_points(points);
+        let lra = Lra { bends: Vec::new(), last_length_mm: 200.0 };
+        let chosen = Structure {
+            model: TubeModel::round(Frame::identity(), lra, RADIUS),
+            noise_mm: 1.2 * NOISE,
+            correlation: 3.0,
+            crowded: Crowded::default(),
+            prior: None,
+            held: Vec::new(),
+            undecided: Vec::new(),
+            decisions: Vec::new(),
+        };
+        realigned(&Whole::new(&cloud, None), &chosen).0
+    }
+
+    #[test]
+    fn a_pass_is_found_to_the_point_and_moved_back() {
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::new(0.0, 2e-4, -3e-4));
+        let drift = Frame::from_parts(nalgebra::Translation3::new(0.0, 0.06, -0.04), turn);
+        let passes = found(&two_passes(&drift));
+        let ends: Vec<u32> = passes.iter().map(|p| p.end).collect();
+        assert_eq!(ends, [8000, u32::MAX]);
+        for x in [0.0, 100.0, 200.0] {
+            let place = Point3::new(x, 0.0, 0.0);
+            let off = passes[1].motion * drift * place - passes[0].motion * place;
+            assert!(off.yz().norm() < 0.006, "{off} at {x}");
+        }
+    }
+
+    #[test]
+    fn one_pass_is_left_where_it_is() {
+        assert!(found(&two_passes(&Frame::identity())).is_empty());
+        assert!(found(&two_passes(&Frame::identity())[..8000]).is_empty());
+    }
+}

@@ -394,6 +394,44 @@ mod tests {
     }
 
     #[test]
+    fn passes_are_walked_where_they_belong() {
+        let (model, cloud) = case(5000);
+        let motion = Frame::new(Vector3::new(0.1, -0.2, 0.05), Vector3::new(1e-3, 0.0, -2e-3));
+        let passes = [
+            ScanPass { end: 1500, motion: Frame::identity() },
+            ScanPass { end: 3200, motion },
+            ScanPass { end: u32::MAX, motion: motion.inverse() },
+        ];
+        let own: Vec<u32> = (0..cloud.len() as u32).filter(|i| !i.is_multiple_of(3)).collect();
+        let moved = |i: &u32| passes.iter().find(|p| i < &p.end).unwrap().motion * cloud.point(*i as usize);
+        let points: Vec<Point3<f64>> = own.iter().map(moved).collect();
+        let expected = Sample::new(points.clone(), &model).pass(&model, 0.2);
+        let whole = Whole::new(&cloud, Some(&own));
+        let mut whole = whole.moved(&passes);
+        assert_eq!(whole.share(own.len()), points);
+        let found = whole.pass(&model, 0.2);
+        let parts = whole.by_pass(&model, 0.2);
+        let total = Pass::total(found.moments.len(), parts.iter().cloned());
+        for pass in [&found, &total] {
+            assert_eq!(pass.used(), expected.used());
+            assert!((pass.cost / expected.cost - 1.0).abs() < 1e-6);
+        }
+        assert!(parts.len() == 3 && parts.iter().all(|p| p.used() > 100));
+    }
+
+    #[test]
+    fn a_range_is_taken_in_runs() {
+        let (_, cloud) = case(5000);
+        let own: Vec<u32> = (0..5000).filter(|i| i % 2 == 0).collect();
+        let whole = Whole::new(&cloud, Some(&own));
+        assert_eq!(whole.within(100, 110, 10), [100, 102, 104, 106, 108]);
+        assert_eq!(whole.around(100, 2), [96, 98, 100, 102]);
+        let some = whole.within(1000, 5000, 1000);
+        assert!(some.len() == 1000 && some[99] == 1198 && some[100] == 1400);
+        assert!(whole.within(4, 4, 10).is_empty());
+    }
+
+    #[test]
     fn each_end_gets_the_points_of_its_straight_in_its_own_frame() {
         let (model, cloud) = case(5000);
         let spine = model.spine();
