@@ -4,13 +4,17 @@
 
 use super::blocks::Blocks;
 
-/// Passes of a scan at most.
+/// Passes of a scan at most: what seems to have more is not made in passes.
 const MOST_PASSES: usize = 16;
+
+/// How far a boundary may be looked for anew when another is added, in chunks.
+const BESIDE: usize = 4;
 
 /// Times that every boundary is looked for anew beside the others.
 const ROUNDS: usize = 2;
 
-/// Boundaries added one by one as long as each is worth its price, the best first.
+/// Boundaries added one by one as long as each is worth its price, the best first. None without any, and where there is no end of
+/// them.
 pub fn boundaries(blocks: &Blocks, price: f64) -> Option<Vec<usize>> {
     let mut found = Vec::new();
     let (mut gain, _) = blocks.gain(&found)?;
@@ -23,14 +27,14 @@ pub fn boundaries(blocks: &Blocks, price: f64) -> Option<Vec<usize>> {
         let tried = (1..blocks.chunks).filter(|b| !found.contains(b));
         let tried = tried.filter_map(|b| Some((blocks.gain(&with(b))?.0, b)));
         let Some((best, b)) = tried.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-        let more = settled(blocks, with(b), blocks.chunks);
+        let more = settled(blocks, with(b), BESIDE);
         let best = blocks.gain(&more)?.0.max(best);
         if best - gain < price {
             break;
         }
         (found, gain) = (more, best);
     }
-    (!found.is_empty()).then_some(found)
+    (1..MOST_PASSES - 1).contains(&found.len()).then_some(found)
 }
 
 /// Every boundary where it is worth the most, no farther from where it was than `reach`.
