@@ -47,6 +47,7 @@ mod section;
 mod sections;
 pub mod simplify;
 mod square;
+mod strangers;
 mod stretches;
 mod stripes;
 pub mod structure;

@@ -13,11 +13,11 @@ use super::fit::Data;
 use super::local::{Arc, Local, Oval, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
-use super::moves::mean_radius_mm;
 use super::section::{
-    Bins, JUDGED_POINTS, MEDIAN_CHI2, OVAL_UNTOLD, SPREADS, Sums, VALUES, Values, cost, doubt_ovality,
-    oval_doubt_mm, solve,
+    Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
+    solve,
 };
+use super::strangers::{Crowded, Strangers, beset, is_at_an_end, is_oval_untold};
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
 use crate::tube::{Spine, any_normal};
 
@@ -31,19 +31,6 @@ const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
 /// Noise over cut-off that is pretended while points are weighed.
 const FIRMNESS: f64 = 1.0;
-/// A section with a larger share of points near the tube and not on it tells nothing: outside it a jaw grips the tube there,
-/// inside it is an end with its face and its bore (which do less harm).
-const MOST_OUTSIDE: f64 = 0.25;
-const MOST_STRANGERS: f64 = 0.5;
-/// With this share of strangers the points may not be those of one section.
-const SEVERAL: f64 = 0.08;
-/// What chance puts outside of three sections, in standard deviations, and a share that does no harm.
-const CHANCE: f64 = 3.5;
-const LEAST_BESET: f64 = 0.05;
-/// So near to an end, in tube radii, and no more than such a share of the end straight, burr, bore and face are among the
-/// points however few they are: a bend would be found there for them.
-const SILENT_RADII: f64 = 0.75;
-const END_SHARE: f64 = 0.375;
 /// So far from an end, in tube radii, burr, bore and face may reach; a section there that misses the tube's shape so many
 /// times more than is usual has some of them; and what its radius and ovality may be off at most, in tube radii.
 const DAMAGED_RADII: f64 = 2.0;
@@ -75,21 +62,6 @@ pub struct Section {
     count: f64,
     /// Least cost that any values reach.
     least: f64,
-}
-
-/// Where something else was scanned with the tube.
-#[derive(Debug, Clone, Default)]
-pub struct Crowded {
-    places: Vec<Point3<f64>>,
-    /// How far around each.
-    reach_mm: f64,
-}
-
-impl Crowded {
-    /// Whether a point lies there.
-    pub fn holds(&self, p: &Point3<f64>) -> bool {
-        self.places.iter().any(|c| (p - c).norm_squared() < self.reach_mm * self.reach_mm)
-    }
 }
 
 /// Sections in order along the tube.
@@ -175,7 +147,7 @@ impl CentreLine {
             cutoff = (CUTOFF_SIGMAS * noise).max(SHRINK * cutoff).min(cutoff);
         }
         let strangers: Vec<Strangers> =
-            grouped.iter().zip(&fits).map(|(s, f)| Strangers::among(s, f, cutoff)).collect();
+            grouped.iter().zip(&fits).map(|(s, f)| Strangers::among(offs(s, f), cutoff)).collect();
         let beset = beset(&strangers);
         let alone: Vec<bool> = strangers.iter().zip(&beset).map(|(s, b)| !s.are_a_crowd() && !b).collect();
         // What crowds one section reaches into the next, in however few points.
@@ -424,29 +396,6 @@ fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
     Sums::from(sums)
 }
 
-/// Whether a section holds a bend too short for an ovality of its own, on a tube so thick that its points would not lie on any
-/// one section: those left would lean to one side.
-fn is_oval_untold(base: &TubeModel, spine: &Spine, (at_mm, length_mm): (f64, f64), cutoff_mm: f64) -> bool {
-    // Bends so short do not know their own CLR.
-    let usual = mean_radius_mm(base).unwrap_or(0.0);
-    let bends = base.lra.bends.iter().enumerate();
-    let short =
-        bends.filter(|(_, b)| !base.is_arc_oval(b.angle_rad * b.radius_mm.min(usual))).map(|(i, _)| i);
-    let holds = |i: usize| {
-        let arc = &spine.segments()[2 * i + 1];
-        let half = 0.5 * length_mm;
-        (arc.start_mm - half..arc.start_mm + arc.length_mm + half).contains(&at_mm)
-    };
-    OVAL_UNTOLD * base.tube_radius_mm > cutoff_mm && { short }.any(holds)
-}
-
-/// Whether a place is where the end of the tube is seen.
-fn is_at_an_end(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
-    let near = |straight_mm: f64| (SILENT_RADII * base.tube_radius_mm).min(END_SHARE * straight_mm);
-    let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
-    at_mm < near(first_mm) || spine.length_mm() - at_mm < near(base.lra.last_length_mm)
-}
-
 /// Takes out of a section's residuals by how much the tube leans against the base tube there: where a bend is missing its points
 /// would else not lie on one section.
 fn straighten(seen: &mut [Seen], fit: &Values, cutoff_mm: f64, radius_mm: f64) {
@@ -489,45 +438,9 @@ fn without_damaged_ends(
     damaged
 }
 
-/// Points of a section near the tube's surface, and of them those outside and inside of it.
-struct Strangers {
-    all: f64,
-    outside: f64,
-    inside: f64,
-}
-
-impl Strangers {
-    fn among(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Strangers {
-        let off = |s: &Seen| s.residual_mm - s.row().dot(fit);
-        let outside = seen.iter().filter(|s| off(s) > cutoff_mm).count() as f64;
-        let inside = seen.iter().filter(|s| off(s) < -cutoff_mm).count() as f64;
-        Strangers { all: seen.len() as f64, outside, inside }
-    }
-
-    /// Whether something else than the tube was scanned beside it: many points near its surface and not on it.
-    fn are_a_crowd(&self) -> bool {
-        self.outside > MOST_OUTSIDE * self.all || self.outside + self.inside > MOST_STRANGERS * self.all
-    }
-
-    /// Whether so many points miss the section that it may be none.
-    fn are_several(&self) -> bool {
-        self.outside + self.inside > SEVERAL * self.all
-    }
-}
-
-/// Where together with both neighbours there are more points outside than chance puts there of what is usual along the tube:
-/// the face of a jaw leaves the tube so flatly that some of its points pass for the tube's.
-fn beset(strangers: &[Strangers]) -> Vec<bool> {
-    let usual = strangers.iter().filter(|s| !s.are_a_crowd());
-    let (outside, all) = usual.fold((0.0, 0.0), |(o, n), s| (o + s.outside, n + s.all));
-    let usual = outside / f64::max(all, 1.0);
-    let around = |i: usize| &strangers[i.saturating_sub(1)..(i + 2).min(strangers.len())];
-    let is_beset = |i: usize| {
-        let (outside, all) = around(i).iter().fold((0.0, 0.0), |(o, n), s| (o + s.outside, n + s.all));
-        let expected = usual * all;
-        outside - expected > (CHANCE * (expected + 1.0).sqrt()).max(LEAST_BESET * all)
-    };
-    (0..strangers.len()).map(is_beset).collect()
+/// By how much points lie outside a section's fit.
+fn offs(seen: &[Seen], fit: &Values) -> impl Iterator<Item = f64> + Clone {
+    seen.iter().map(move |s| s.residual_mm - s.row().dot(fit))
 }
 
 /// Robust standard deviation of the points about their sections' fits.
@@ -536,8 +449,7 @@ fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     let mut spent = 0.0;
     for (seen, fit) in grouped.iter().zip(fits) {
         let before = sizes.len();
-        let off = seen.iter().map(|s| (s.residual_mm - s.row().dot(fit)).abs());
-        sizes.extend(off.filter(|r| *r < cutoff_mm));
+        sizes.extend(offs(seen, fit).map(f64::abs).filter(|r| *r < cutoff_mm));
         spent += ((sizes.len() - before) as f64 * 0.5).min(VALUES as f64);
     }
     let n = sizes.len() as f64;
