@@ -4,7 +4,8 @@
 //! [`moderate`] cloud, tube [`radius`] from jets, points onto the spine by [`mls`] with [`cylinder`]s, those that
 //! `follow` one another joined by [`crust`], its points by [`owner`]), fewest vertices ([`simplify`]), fewest arcs
 //! ([`arcline`], [`apollonius`]), how many bends ([`structure`], by `search` on the centre line measured in `sections`; once
-//! more where `realign` finds that the scan's passes disagree), least squares on all points, ends and sigmas ([`finish`]). Both fits descend by `fit` on normal equations that `normal` assembles from a moment per segment.
+//! more where `realign` finds that the scan's passes disagree), least squares on all points, ends and sigmas ([`finish`]).
+//! Both fits descend by `fit` on normal equations that `normal` assembles from a moment per segment.
 
 pub mod apollonius;
 pub mod arcline;
@@ -56,14 +57,12 @@ mod whole;
 
 pub use error::ReconstructError;
 use nalgebra::Point3;
-use rayon::prelude::*;
 
 use crate::cloud::PointCloud;
 use crate::tube::{Decision, Lra, MeasuredTube, Nominal, Spine};
 use model::TubeModel;
 use scene::Scene;
 use structure::Shown;
-use whole::ScanPass;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -142,22 +141,6 @@ fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
 }
 
-/// Points of the sample that is drawn from passes moved onto each other; and how near to the tube they must be, in tube radii.
-const MOST_DRAWN: usize = 100_000;
-const NEAR_RADII: f64 = 0.4;
-
-/// The sample of a tube with its scan's passes where they belong; as it was where there is one pass.
-fn together(shown: &Shown, passes: &[ScanPass], model: &TubeModel) -> Vec<Point3<f64>> {
-    if passes.is_empty() {
-        return shown.sample.to_vec();
-    }
-    let (spine, radius_mm) = (model.spine(), model.tube_radius_mm);
-    let is_near = |p: &Point3<f64>| (spine.closest(p).distance_mm - radius_mm).abs() < NEAR_RADII * radius_mm;
-    let drawn = shown.whole.moved(passes).share(MOST_DRAWN);
-    let near: Vec<Point3<f64>> = drawn.into_par_iter().filter(is_near).collect();
-    PointCloud::from_points(&near).thinned_without_strays(SAMPLE_CELL_RADII * radius_mm).iter().collect()
-}
-
 /// Reconstructs with the structure by `guide`, or freely.
 fn by(
     cloud: &PointCloud,
@@ -179,12 +162,13 @@ fn by(
         Some(nominal) => guided::choose(shown, nominal),
         None => structure::choose(shown).map(|s| (s, Vec::new())),
     };
-    let shown = Shown::new(cloud, &scene, &sample);
+    let mut shown = Shown::new(cloud, &scene, &sample);
     let (mut chosen, mut notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
     let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, &chosen));
-    let again = in_pool(|| together(&shown, &passes, &chosen.model));
-    let shown = Shown { whole: shown.whole.moved(&passes), sample: &again, ..shown };
-    if !passes.is_empty() {
+    let again =
+        (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
+    if let Some(again) = &again {
+        shown = Shown { whole: shown.whole.moved(&passes), sample: again, ..shown };
         (chosen, notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
         let what = format!("{} passes of the scan moved onto each other", passes.len());
         chosen.decisions.push(Decision { what, bend: None, gain, kept: true });

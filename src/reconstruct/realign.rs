@@ -12,22 +12,27 @@ mod known;
 use std::collections::BTreeMap;
 
 use nalgebra::{DVector, Point3, SVector, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 
 use blocks::{Blocks, MOTION, Sum};
 pub use known::{information, moved_mm};
 
+use super::SAMPLE_CELL_RADII;
 use super::fit::CUTOFF_SIGMAS;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
 use super::section::{Bins, oval_doubt_mm};
+use super::sections::FIRST_CUTOFF;
 use super::strangers::Crowded;
 use super::stripes;
 use super::structure::Structure;
 use super::whole::{ScanPass, Whole};
+use crate::cloud::PointCloud;
 use crate::tube::Frame;
 
-/// Points looked at.
+/// Points looked at, in runs of so many as they lie in the file.
 const MOST_POINTS: usize = 50_000;
+const RUN: usize = 100;
 
 /// The file's order is cut into so many chunks; those beside a boundary, once found, into so many again, so many times at most
 /// and down to chunks of so few points.
@@ -53,6 +58,9 @@ const OWN_RADIUS: f64 = 3e-4;
 const ARC_OVALITY: f64 = 0.004;
 /// Where a section lies is not known beforehand, in tube radii.
 const ANYWHERE: f64 = 0.3;
+
+/// Points that the sample is thinned from.
+const MOST_DRAWN: usize = 100_000;
 
 /// Derivatives of a point's residual by its section's values and by its pass's motion, and the residual.
 type Row = SVector<f64, 12>;
@@ -101,10 +109,9 @@ impl Chunk {
 /// The passes that a scan was made in and how each must move to lie on the others, of a tube whose structure is about known;
 /// and by how much the squared residuals fall, over the variance of a point. Empty where nothing says that there are several.
 pub fn realigned(whole: &Whole, chosen: &Structure) -> (Vec<ScanPass>, f64) {
-    let Structure { model, noise_mm, correlation, .. } = chosen;
-    let noise_mm = *noise_mm;
+    let (model, noise_mm) = (&chosen.model, chosen.noise_mm);
     let passes_mm = stripes::disagreement_mm(whole, model, noise_mm);
-    if passes_mm <= 0.0 && *correlation < STRUCTURED {
+    if passes_mm <= 0.0 && chosen.correlation < STRUCTURED {
         return (Vec::new(), 0.0);
     }
     let own_mm = (noise_mm * noise_mm - passes_mm * passes_mm).max(0.0).sqrt().max(1e-6);
@@ -123,6 +130,15 @@ pub fn realigned(whole: &Whole, chosen: &Structure) -> (Vec<ScanPass>, f64) {
     asked.passes().unwrap_or_default()
 }
 
+/// The points that decide a tube's structure, of a scan with its passes where they belong.
+pub fn sample(whole: &Whole, model: &TubeModel) -> Vec<Point3<f64>> {
+    let (spine, radius_mm) = (model.spine(), model.tube_radius_mm);
+    let is_near =
+        |p: &Point3<f64>| (spine.closest(p).distance_mm - radius_mm).abs() < FIRST_CUTOFF * radius_mm;
+    let near: Vec<Point3<f64>> = whole.share(MOST_DRAWN).into_par_iter().filter(is_near).collect();
+    PointCloud::from_points(&near).thinned_without_strays(SAMPLE_CELL_RADII * radius_mm).iter().collect()
+}
+
 /// The middle of a tube, and how far it reaches from there.
 fn middle(model: &TubeModel) -> (Point3<f64>, f64) {
     let spine = model.spine();
@@ -136,7 +152,7 @@ fn middle(model: &TubeModel) -> (Point3<f64>, f64) {
 impl Asked<'_> {
     /// None when there is one pass only.
     fn passes(&self) -> Option<(Vec<ScanPass>, f64)> {
-        let points = self.whole.within(0, u32::MAX, MOST_POINTS).len() as f64;
+        let points = self.whole.runs(RUN, MOST_POINTS).len() as f64;
         let price = SURELY * (MOTION as f64 * points.max(2.0).ln() + 2.0 * (CHUNKS as f64).ln());
         let mut chunks = self.chunks(&[(0, u32::MAX)], CHUNKS);
         let mut found = cut::boundaries(&self.blocks(&chunks), price)?;
@@ -173,7 +189,7 @@ impl Asked<'_> {
         cuts.dedup();
         let place = |index: &u32| cuts.binary_search(index).unwrap_or(0);
         let mut chunks: Vec<Chunk> = cuts.iter().map(|&from| Chunk::from(from)).collect();
-        self.sum_up(&mut chunks, &self.whole.within(0, u32::MAX, MOST_POINTS));
+        self.sum_up(&mut chunks, &self.whole.runs(RUN, MOST_POINTS));
         let blocks = self.blocks(&chunks);
         let mut found: Vec<usize> = likeliest.iter().map(place).collect();
         let (mut gain, mut motions) = blocks.gain(&found)?;
@@ -232,7 +248,7 @@ impl Asked<'_> {
         let mut order = Vec::new();
         let mut chunks: Vec<Chunk> = Vec::new();
         for &(from, end) in ranges {
-            let points = self.whole.within(from, end, MOST_POINTS);
+            let points = self.whole.runs_within(from, end, RUN, MOST_POINTS);
             let each = each.min(points.len()).max(1);
             for k in 0..each {
                 let (at, next) = (k * points.len() / each, (k + 1) * points.len() / each);
@@ -320,7 +336,6 @@ impl Asked<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::PointCloud;
     use crate::tube::Lra;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;

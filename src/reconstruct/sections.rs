@@ -25,7 +25,7 @@ use crate::tube::{Spine, any_normal};
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
 
 /// Points farther than this from the base tube do not count, in tube radii.
-const FIRST_CUTOFF: f64 = 0.4;
+pub const FIRST_CUTOFF: f64 = 0.4;
 /// Rounds in which the cut-off comes down to the noise, no faster than by this factor.
 const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
@@ -129,8 +129,7 @@ impl CentreLine {
         let seen = see(points, base, &bins);
         let mut grouped = group(seen, bins.total);
         // Near an end burr, bore and face lean, not the tube.
-        let near_mm = DAMAGED_RADII * base.tube_radius_mm;
-        let inside: Vec<bool> = bins.places_mm().map(|at| at.min(spine.length_mm() - at) > near_mm).collect();
+        let inside: Vec<bool> = bins.places_mm().map(|at| !may_be_damaged(base, &spine, at)).collect();
         let mut fits: Vec<Values> = vec![Values::zeros(); grouped.len()];
         let mut cutoff = FIRST_CUTOFF * base.tube_radius_mm;
         let mut noise = 0.1 * cutoff;
@@ -192,8 +191,9 @@ impl CentreLine {
             });
         }
         if fitted {
-            let ends = without_damaged_ends(&mut sections, base, &spine, noise);
-            places.extend(ends);
+            let (damaged, sound) = damaged_ends(sections, base, &spine, noise);
+            places.extend(damaged.iter().map(|s| s.centre));
+            sections = sound;
         }
         let count = sections.iter().map(|s| s.count).sum();
         let crowded = Crowded { places, reach_mm: base.tube_radius_mm.hypot(0.5 * bins.length_mm) };
@@ -416,26 +416,29 @@ fn straighten(seen: &mut [Seen], fit: &Values, cutoff_mm: f64, radius_mm: f64) {
     seen.iter_mut().for_each(|s| s.residual_mm -= row(s).dot(&slopes));
 }
 
-/// Takes the sections near the ends away that have not the tube's shape, wherever they lie: a burr, a bore, a face is among
-/// their points, in however few of them. Returns where they were.
-fn without_damaged_ends(
-    sections: &mut Vec<Section>,
+/// Whether burr, bore and face may reach a place.
+fn may_be_damaged(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
+    at_mm.min(spine.length_mm() - at_mm) <= DAMAGED_RADII * base.tube_radius_mm
+}
+
+/// The sections near the ends that have not the tube's shape, wherever they lie: a burr, a bore, a face is among their points, in
+/// however few of them. And the others.
+fn damaged_ends(
+    sections: Vec<Section>,
     base: &TubeModel,
     spine: &Spine,
     noise_mm: f64,
-) -> Vec<Point3<f64>> {
-    let shape = [TUBES_OWN, 0.3, 0.3, TUBES_OWN, TUBES_OWN].map(|s| s * base.tube_radius_mm);
+) -> (Vec<Section>, Vec<Section>) {
+    let [_, place, ..] = SPREADS;
+    let shape = [TUBES_OWN, place, place, TUBES_OWN, TUBES_OWN].map(|s| s * base.tube_radius_mm);
     let misfit =
         |s: &Section| (cost(&s.sums, &solve(&s.sums, &shape, noise_mm)) - s.least) / (noise_mm * noise_mm);
     let usual = median(&mut sections.iter().map(misfit).collect::<Vec<_>>()).unwrap_or(0.0);
-    let near_mm = DAMAGED_RADII * base.tube_radius_mm;
     let is_damaged = |s: &Section| {
         let at_mm = spine.closest(&s.centre).arc_length_mm;
-        at_mm.min(spine.length_mm() - at_mm) < near_mm && misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2)
+        may_be_damaged(base, spine, at_mm) && misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2)
     };
-    let damaged = sections.iter().filter(|s| is_damaged(s)).map(|s| s.centre).collect();
-    sections.retain(|s| !is_damaged(s));
-    damaged
+    sections.into_iter().partition(is_damaged)
 }
 
 /// By how much points lie outside a section's fit.

@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use super::model::TubeModel;
 use super::moves::mean_radius_mm;
 use super::section::OVAL_UNTOLD;
-use crate::tube::Spine;
+use crate::tube::{Bend, Spine};
 
 /// A section with a larger share of points near the tube and not on it tells nothing: outside it a jaw grips the tube there,
 /// inside it is an end with its face and its bore (which do less harm).
@@ -24,7 +24,7 @@ const LEAST_BESET: f64 = 0.05;
 const SILENT_RADII: f64 = 0.75;
 const END_SHARE: f64 = 0.375;
 
-/// Where something else was scanned with the tube.
+/// Where sections tell nothing.
 #[derive(Debug, Clone, Default)]
 pub struct Crowded {
     /// Middles of the sections.
@@ -91,15 +91,13 @@ pub fn is_oval_untold(
 ) -> bool {
     // Bends so short do not know their own CLR.
     let usual = mean_radius_mm(base).unwrap_or(0.0);
-    let bends = base.lra.bends.iter().enumerate();
-    let short =
-        bends.filter(|(_, b)| !base.is_arc_oval(b.angle_rad * b.radius_mm.min(usual))).map(|(i, _)| i);
-    let holds = |i: usize| {
+    let half = 0.5 * length_mm;
+    let is_in_a_short_one = |(i, bend): (usize, &Bend)| {
         let arc = &spine.segments()[2 * i + 1];
-        let half = 0.5 * length_mm;
-        (arc.start_mm - half..arc.start_mm + arc.length_mm + half).contains(&at_mm)
+        let holds = (arc.start_mm - half..arc.start_mm + arc.length_mm + half).contains(&at_mm);
+        holds && !base.is_arc_oval(bend.angle_rad * bend.radius_mm.min(usual))
     };
-    OVAL_UNTOLD * base.tube_radius_mm > cutoff_mm && { short }.any(holds)
+    OVAL_UNTOLD * base.tube_radius_mm > cutoff_mm && base.lra.bends.iter().enumerate().any(is_in_a_short_one)
 }
 
 /// Whether a place is where the end of the tube is seen.

@@ -85,7 +85,7 @@ pub struct Structure {
     pub noise_mm: f64,
     /// How many points say one thing.
     pub correlation: f64,
-    /// Where something else was scanned with the tube.
+    /// Where the tube's sections tell nothing.
     pub crowded: Crowded,
     /// Expectation of the bend radii that it was fitted with.
     pub prior: Option<RadiusPrior>,

@@ -12,15 +12,11 @@ use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
 use super::moderate::drawn;
 use super::moments::{CHUNK, Pass};
-
 use crate::cloud::PointCloud;
 use crate::tube::{Frame, Spine};
 
 /// Chunks at most: their sums take room.
 const MOST_CHUNKS: usize = 64;
-
-/// Points that are taken or left together where not all of a range are.
-const SHORT_RUN: usize = 100;
 
 /// The tube is taken to go on this many radii beyond its first guess of the ends.
 const BEYOND_RADII: f64 = 2.0;
@@ -72,27 +68,30 @@ impl<'a> Whole<'a> {
 
     /// Indices of at most about so many of the points, in runs of `run` as they lie in the file.
     pub fn runs(&self, run: usize, most: usize) -> Vec<u32> {
-        let every = self.len().div_ceil(most).max(1);
-        let kept = (0..self.len()).filter(|i| (i / run).is_multiple_of(every));
-        kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+        self.runs_within(0, u32::MAX, run, most)
     }
 
-    /// Indices from `from` to before `end` of at most about so many of the points, in runs as they lie in the file.
-    pub fn within(&self, from: u32, end: u32, most: usize) -> Vec<u32> {
+    /// The same of the points whose indices are from `from` to before `end`.
+    pub fn runs_within(&self, from: u32, end: u32, run: usize, most: usize) -> Vec<u32> {
         let (first, behind) = match self.own {
             None => (from as usize, (end as usize).min(self.cloud.len())),
             Some(own) => (own.partition_point(|i| *i < from), own.partition_point(|i| *i < end)),
         };
         let every = behind.saturating_sub(first).div_ceil(most).max(1);
-        let kept = (first..behind).filter(|i| ((i - first) / SHORT_RUN).is_multiple_of(every));
-        kept.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+        let kept = (first..behind).filter(|i| ((i - first) / run).is_multiple_of(every));
+        kept.map(|i| self.index(i)).collect()
     }
 
     /// Indices of the points about one, `reach` to either side.
     pub fn around(&self, index: u32, reach: usize) -> Vec<u32> {
         let at = self.own.map_or(index as usize, |own| own.partition_point(|i| *i < index));
         let range = at.saturating_sub(reach)..(at + reach).min(self.len());
-        range.map(|i| self.own.map_or(i as u32, |own| own[i])).collect()
+        range.map(|i| self.index(i)).collect()
+    }
+
+    /// The cloud's index of the tube's point `i`.
+    fn index(&self, i: usize) -> u32 {
+        self.own.map_or(i as u32, |own| own[i])
     }
 
     /// Those of the cloud's points that have these indices.
@@ -130,8 +129,7 @@ impl<'a> Whole<'a> {
 
     /// At most so many of the points, where they belong, drawn from all of the file.
     pub fn share(&self, most: usize) -> Vec<Point3<f64>> {
-        let of = |i: usize| self.own.map_or(i as u32, |own| own[i]);
-        drawn(self.len(), most).into_iter().map(|i| self.point(of(i))).collect()
+        drawn(self.len(), most).into_iter().map(|i| self.point(self.index(i))).collect()
     }
 
     /// Walks all points. Each is given to `add` with its segment and its place in that segment's frame; one `new` per
@@ -424,11 +422,11 @@ mod tests {
         let (_, cloud) = case(5000);
         let own: Vec<u32> = (0..5000).filter(|i| i % 2 == 0).collect();
         let whole = Whole::new(&cloud, Some(&own));
-        assert_eq!(whole.within(100, 110, 10), [100, 102, 104, 106, 108]);
+        assert_eq!(whole.runs_within(100, 110, 100, 10), [100, 102, 104, 106, 108]);
         assert_eq!(whole.around(100, 2), [96, 98, 100, 102]);
-        let some = whole.within(1000, 5000, 1000);
+        let some = whole.runs_within(1000, 5000, 100, 1000);
         assert!(some.len() == 1000 && some[99] == 1198 && some[100] == 1400);
-        assert!(whole.within(4, 4, 10).is_empty());
+        assert!(whole.runs_within(4, 4, 100, 10).is_empty());
     }
 
     #[test]

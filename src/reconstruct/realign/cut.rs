@@ -13,8 +13,8 @@ const BESIDE: usize = 4;
 /// Times that every boundary is looked for anew beside the others.
 const ROUNDS: usize = 2;
 
-/// Boundaries added one by one as long as each is worth its price, the best first. None without any, and where there is no end of
-/// them.
+/// Boundaries added one by one as long as each is worth its price, the best first. None without any, and
+/// where there is no end of them.
 pub fn boundaries(blocks: &Blocks, price: f64) -> Option<Vec<usize>> {
     let mut found = Vec::new();
     let (mut gain, _) = blocks.gain(&found)?;
