@@ -1,5 +1,5 @@
 //! How right and how accurate the reconstruction is on simulated scans: a row per case, totals, targets.
-//! `cargo run --release --example accuracy -- thirty|hard|paper [--seed FIRST] [--count M] [--nominal] [--markdown]`; exit
+//! `cargo run --release --example accuracy -- thirty|hard|flattened|paper [--seed FIRST] [--count M] [--nominal] [--markdown]`; exit
 //! status 0 when the targets of the set are met, 1 when not.
 
 #![allow(clippy::print_stdout)] // an example prints
@@ -13,7 +13,8 @@ use benderd::trial::accuracy::{Known, Set, Tally, heading, markdown, row, run, t
 
 #[derive(Debug, Parser)]
 struct Args {
-    /// thirty (like the benchmark of paper 000), hard (scans spoiled in every way) or paper (its one example).
+    /// thirty (like the benchmark of paper 000), hard (scans spoiled in every way), flattened (thirty's tubes with flattened
+    /// outer walls) or paper (its one example).
     set: Set,
     /// Seed of the first case.
     #[arg(long, default_value_t = 0)]

@@ -353,6 +353,8 @@ fn measured_tube_reversed_is_its_table_reversed() {
         radius_sigma_mm: Some(0.05),
         ovality: Some(b.radius_mm / 1000.0),
         ovality_sigma: Some(0.001),
+        flattening: Some(b.radius_mm / 5000.0),
+        flattening_sigma: Some(0.001),
     };
     let json = serde_json::json!({
         "tube_radius_mm": 10.0, "last_length_mm": 40.0, "last_length_sigma_mm": 0.04,
@@ -369,7 +371,11 @@ fn measured_tube_reversed_is_its_table_reversed() {
     assert_eq!(back.intersection_mm, [Some(4.0), None, Some(2.0), Some(1.0)]);
     assert_eq!(back.bends[1].length_sigma_mm, Some(0.03), "a sigma travels with its value");
     assert_eq!(back.bends[0].rotation_sigma_rad, Some(0.0));
-    assert_eq!(back.bends[2].ovality, Some(0.03), "ovality belongs to its bend");
+    assert_eq!(
+        (back.bends[2].ovality, back.bends[2].flattening),
+        (Some(0.03), Some(0.006)),
+        "a section belongs to its bend"
+    );
     let about: Vec<Option<usize>> = back.decisions.iter().map(|d| d.bend).collect();
     assert_eq!(about, [Some(3), None], "a decision goes with its bend");
     assert_eq!(back.reversed(), measured);

@@ -71,10 +71,12 @@ pub fn table(tube: &MeasuredTube) -> String {
     if tube.reversed == Some(true) {
         out += "the scan starts at the part's other end; turned round\n";
     }
-    // The column only where some bend has it.
+    // These columns only where some bend has them.
     let oval = tube.bends.iter().any(|b| b.ovality.is_some());
+    let flattened = tube.bends.iter().any(|b| b.flattening.is_some());
     out += "bend        length mm      rotation deg         angle deg            CLR mm";
-    out += if oval { "        ovality %\n" } else { "\n" };
+    out += if oval { "        ovality %" } else { "" };
+    out += if flattened { "      flattening %\n" } else { "\n" };
     for (i, b) in tube.bends.iter().enumerate() {
         let degrees = |rad: Option<f64>| rad.map(f64::to_degrees);
         let percent = |share: Option<f64>| share.map(|s| 100.0 * s);
@@ -88,6 +90,9 @@ pub fn table(tube: &MeasuredTube) -> String {
         );
         if oval {
             out += &format!(" {}", cell(percent(b.ovality), percent(b.ovality_sigma)));
+        }
+        if flattened {
+            out += &format!(" {}", cell(percent(b.flattening), percent(b.flattening_sigma)));
         }
         out += "\n";
     }

@@ -43,10 +43,10 @@ struct ScanArgs {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=20))]
     views: u8,
     /// Noise along the ray at normal incidence (one sigma).
-    #[arg(long, default_value_t = 0.03, value_parser = at_most::<10>)]
+    #[arg(long, default_value_t = 0.03, value_parser = at_most(10.0))]
     noise_mm: f64,
     /// Share of flying points, 0 to 1.
-    #[arg(long, default_value_t = 0.005, value_parser = at_most::<1>)]
+    #[arg(long, default_value_t = 0.005, value_parser = at_most(1.0))]
     outliers: f64,
     /// Patches of the surface without data.
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=1000))]
@@ -61,16 +61,21 @@ struct ScanArgs {
     #[arg(long)]
     jaws: Option<Jaws>,
     /// How far passes disagree (one sigma of each pass's displacement).
-    #[arg(long, default_value_t = 0.0, value_parser = at_most::<10>)]
+    #[arg(long, default_value_t = 0.0, value_parser = at_most(10.0))]
     drift_mm: f64,
     /// Ovality of every bend: (largest - smallest) / nominal diameter.
-    #[arg(long, default_value_t = 0.0, value_parser = at_most::<1>)]
+    #[arg(long, default_value_t = 0.0, value_parser = at_most(1.0))]
     ovality: f64,
+    /// Flattening of every bend's outer wall: how far it lies within the oval section / nominal diameter.
+    #[arg(long, default_value_t = 0.0, value_parser = at_most(0.1))]
+    flattening: f64,
 }
 
-fn at_most<const MOST: u32>(word: &str) -> Result<f64, String> {
-    let value: f64 = word.parse().map_err(|_| "not a number".to_owned())?;
-    if (0.0..=f64::from(MOST)).contains(&value) { Ok(value) } else { Err(format!("allowed is 0 to {MOST}")) }
+fn at_most(most: f64) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
+    move |word| {
+        let value: f64 = word.parse().map_err(|_| "not a number".to_owned())?;
+        if (0.0..=most).contains(&value) { Ok(value) } else { Err(format!("allowed is 0 to {most}")) }
+    }
 }
 
 /// Runs the subcommand.
@@ -83,8 +88,9 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 fn simulate_scan(args: &ScanArgs) -> anyhow::Result<Outcome> {
     let part = load_part(&args.part, &Materials::shipped()?)?;
-    let ovality = vec![args.ovality; part.lra.bends.len()];
-    let shape = TubeShape { ovality, ..TubeShape::round(part.lra, part.od_mm) };
+    let [ovality, flattening] =
+        [args.ovality, args.flattening].map(|share| vec![share; part.lra.bends.len()]);
+    let shape = TubeShape { ovality, flattening, ..TubeShape::round(part.lra, part.od_mm) };
     let settings = ScanSettings {
         density: Density::Points(args.points as usize),
         views: args.views.into(),

@@ -169,6 +169,8 @@ fn as_measured(lra: &Lra) -> MeasuredTube {
         radius_sigma_mm: None,
         ovality: None,
         ovality_sigma: None,
+        flattening: None,
+        flattening_sigma: None,
     };
     MeasuredTube {
         last_length_sigma_mm: Some(0.1),

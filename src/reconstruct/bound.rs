@@ -40,7 +40,7 @@ pub fn cramer_rao(truth: &TubeModel, points: Vec<Point3<f64>>, noise_mm: f64) ->
     let jacobian = jacobian(truth, &parameters, &ends);
     let covariance = &jacobian * invert(&normal) * jacobian.transpose();
     let sigmas = covariance.diagonal().iter().map(|v| noise_mm * v.max(0.0).sqrt()).collect();
-    let Values { lengths, rotations, angles, radii, corners, ovalities: _, tube_radius } =
+    let Values { lengths, rotations, angles, radii, corners, ovalities: _, flattenings: _, tube_radius } =
         values(truth, &ends).like(sigmas);
     Bound {
         lengths_mm: lengths,

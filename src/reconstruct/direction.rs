@@ -71,12 +71,13 @@ fn turn_round(found: Reconstruction) -> Reconstruction {
     // Looking back the tangent and the plane's normal change sign.
     let start = end * Frame::rotation(Vector3::new(0.0, std::f64::consts::PI, 0.0));
     let lra = found.lra.reversed();
-    let ovality_mm = found.ovality_mm.into_iter().rev().collect();
+    let turned = |bends: Vec<f64>| bends.into_iter().rev().collect();
     Reconstruction {
         measured: found.measured.reversed(),
         spine: Spine::from_lra(&lra, start),
         lra,
-        ovality_mm,
+        ovality_mm: turned(found.ovality_mm),
+        flattening_mm: turned(found.flattening_mm),
     }
 }
 
@@ -97,14 +98,20 @@ mod tests {
         let start = Frame::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, 0.2, 0.3));
         let spine = Spine::from_lra(&lra, start);
         let measured = MeasuredTube::exact(&lra, 10.0);
-        let found =
-            Reconstruction { measured, spine: spine.clone(), lra, ovality_mm: vec![-0.1, -0.2, -0.3] };
+        let found = Reconstruction {
+            measured,
+            spine: spine.clone(),
+            lra,
+            ovality_mm: vec![-0.1, -0.2, -0.3],
+            flattening_mm: vec![-0.01, -0.02, -0.03],
+        };
         let part = Nominal::of_table(nominal.clone(), 25.0, 1.0);
         let turned = as_nominal(found, &part);
         assert_eq!(turned.measured.warnings.len(), 1, "the bracket's radius is another: {turned:?}");
         assert_eq!(turned.measured.reversed, Some(true));
         assert_eq!(turned.lra, nominal);
         assert_eq!(turned.ovality_mm, [-0.3, -0.2, -0.1]);
+        assert_eq!(turned.flattening_mm, [-0.03, -0.02, -0.01]);
         for k in 0..=20 {
             let at = turned.spine.length_mm() * k as f64 / 20.0;
             let same = spine.point_at(spine.length_mm() - at);

@@ -7,13 +7,15 @@ use nalgebra::Point3;
 
 use super::error::ReconstructError;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
+use super::flattening::{self, freed};
 use super::measure;
+use super::model::Flattening;
 use super::moments::Sample;
 use super::moves::without_bend;
 use super::outline::solid_start;
 use super::profile;
 use super::realign;
-use super::stretches::correlation;
+use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
 use super::undecided::{Undecided, widened};
 use super::whole::Whole;
@@ -95,12 +97,14 @@ fn finish_as_chosen(
         let (radius_mm, bends) = (shown.radius_mm, best.model.lra.bends.len());
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
+    let lone = flattened(&mut whole, &best, chosen);
+    let correlation = lone.as_ref().map_or_else(|| correlation(&whole, &best), |lone| lone.1);
+    best = lone.map_or(best, |lone| lone.0);
     // Sigmas by what the points say together, not by their number; what is held was found so already.
-    let correlation = correlation(&whole, &best);
     if whole.passes().len() > 1 {
         best.information = realign::information(&whole, &best);
     }
-    let information = &best.information / correlation.near;
+    let information = flattening::expected(&best.information / correlation.near, &best);
     let held = profile::tightened(&information, &best.parameters, &chosen.held);
     best.covariance = widened(held, &best.parameters, &chosen.undecided);
     let ends = end_points(&whole, shown.sample, &best);
@@ -118,8 +122,12 @@ fn finish_as_chosen(
     measured.decisions.clone_from(&chosen.decisions);
     measured.points_total = whole.file_len();
     measured.warnings.splice(0..0, warnings.iter().cloned());
-    let TubeModel { lra, ovality_mm, .. } = best.model.clone();
-    Ok(Reconstruction { measured, spine: best.model.spine(), lra, ovality_mm })
+    let (spine, TubeModel { lra, ovality_mm, flattening, .. }) = (best.model.spine(), best.model);
+    let flattening_mm = match flattening {
+        Flattening::Free { bends_mm, .. } => bends_mm,
+        Flattening::Known(_) => Vec::new(),
+    };
+    Ok(Reconstruction { measured, spine, lra, ovality_mm, flattening_mm })
 }
 
 /// The bend, counted from 1, behind which the points show no straight.
@@ -132,9 +140,29 @@ fn ends_in_bend(model: &TubeModel) -> Option<usize> {
 
 /// The sample's fit taken to all points.
 fn fit_to_all(whole: &mut Whole, chosen: &Structure) -> Fit {
-    let cutoff_mm = CUTOFF_SIGMAS * chosen.noise_mm;
+    let mut start = chosen.model.clone();
+    if start.flattening != Flattening::NONE {
+        start.flattening = freed(&start);
+    }
+    fit_from(whole, &start, CUTOFF_SIGMAS * chosen.noise_mm, chosen)
+}
+
+fn fit_from(whole: &mut Whole, start: &TubeModel, cutoff_mm: f64, chosen: &Structure) -> Fit {
     let effort = Effort { cutoff_mm, rounds: 2, steps: 20, prior: chosen.prior };
-    polish(whole, &chosen.model, effort, &chosen.held).unwrap_or_else(|| fit(whole, &chosen.model, effort))
+    polish(whole, start, effort, &chosen.held).unwrap_or_else(|| fit(whole, start, effort))
+}
+
+/// The fit with flattened outer walls, where the points ask for them, and how they correlate about it: what is left of a wall
+/// that the fit lacks would pass for correlation, so the last word is had with the walls fitted.
+fn flattened(whole: &mut Whole, fit: &Fit, chosen: &Structure) -> Option<(Fit, Correlation)> {
+    if fit.model.flattening.is_free() {
+        return None;
+    }
+    let told = flattening::told(whole, &fit.model, fit.cutoff_mm)?;
+    let start = TubeModel { flattening: told.flattening.clone(), ..fit.model.clone() };
+    let fit = fit_from(whole, &start, fit.cutoff_mm, chosen);
+    let correlation = correlation(whole, &fit);
+    told.stands_out(correlation.near).then_some((fit, correlation))
 }
 
 /// The points that show the tube's ends, see [`Whole::ends`].

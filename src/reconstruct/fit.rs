@@ -3,7 +3,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::model::{Parameter, TubeModel};
+use super::model::{Flattening, Parameter, TubeModel};
 use super::moments::{Moment, Pass, Sample};
 use super::normal::equations;
 use crate::recognize::MEDIAN_TO_SIGMA;
@@ -382,6 +382,10 @@ fn expectations<'a>(
 ) -> impl Iterator<Item = (usize, f64, f64)> + 'a {
     parameters.iter().enumerate().filter_map(move |(j, parameter)| match *parameter {
         Parameter::Ovality(i) => Some((j, model.ovality_mm[i], OVALITY_SPREAD * model.tube_radius_mm)),
+        Parameter::Flattening(i) => match &model.flattening {
+            Flattening::Free { bends_mm, spread_mm } => Some((j, bends_mm[i], *spread_mm)),
+            Flattening::Known(_) => None,
+        },
         Parameter::BendRadius(i) => {
             prior.map(|p| (j, model.lra.bends[i].radius_mm - p.radius_mm, p.spread_mm))
         }

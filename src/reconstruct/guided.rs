@@ -12,7 +12,7 @@
 mod doubt;
 mod own;
 
-use nalgebra::{DMatrix, Point3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, UnitQuaternion, Vector3};
 
 use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, RadiusPrior, Way, descend, fit, polish};
@@ -49,10 +49,10 @@ pub type Chosen = (Structure, Vec<String>);
 
 /// Finds the structure by the nominal, or freely where that explains the scan better. None when neither does.
 pub fn choose(shown: &Shown, nominal: &Nominal) -> Option<Chosen> {
-    let Shown { polygon, sample, radius_mm, .. } = *shown;
+    let polygon = shown.polygon;
     let free = || structure::choose(shown);
     let part = nominal.lra.merged();
-    let Some(guided) = Guided::fit(polygon, sample, radius_mm, &part) else {
+    let Some(guided) = Guided::fit(shown, &part) else {
         return free().map(|own| (told(own, "it cannot lie on the centre line", 0.0, false), Vec::new()));
     };
     let taken = |why: &str| told(guided.structure(shown), why, 0.0, true);
@@ -158,13 +158,14 @@ fn has_common_radius(part: &Lra) -> bool {
 
 impl Guided {
     /// The nominal laid and fitted in the better of both directions; None where it cannot lie.
-    fn fit(polygon: &[Point3<f64>], sample: &[Point3<f64>], radius_mm: f64, part: &Lra) -> Option<Guided> {
+    fn fit(shown: &Shown, part: &Lra) -> Option<Guided> {
+        let Shown { polygon, sample, radius_mm, .. } = *shown;
         let course = Course::new(polygon, radius_mm).filter(|_| !part.bends.is_empty())?;
         let prior = expected_radii(part);
         let rough = CentreLine::of_polygon(polygon, radius_mm);
         let laid =
             [(part.clone(), false), (part.reversed(), true)].into_iter().filter_map(|(part, reversed)| {
-                let start = lay(&course, &part)?;
+                let start = TubeModel { flattening: shown.flattening.clone(), ..lay(&course, &part)? };
                 Some((fitted(&rough, start, prior, 1.0, ROUGH_STEPS), part, reversed))
             });
         // Where it fits as well both ways, the more alike.

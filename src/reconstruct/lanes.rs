@@ -5,15 +5,18 @@
 
 #![allow(clippy::needless_range_loop)] // one index for all that lies side by side
 
-use super::local::{Arc, Local, Oval};
+use super::local::{Arc, Local, Outline};
 use super::model::TubeModel;
-use super::moments::{Moment, Pass};
+use super::moments::{FLATTENING, Moment, Pass, SQUARE};
 
 /// Points side by side.
 const LANES: usize = 32;
 
 /// One number for each of the points.
 type Lane = [f64; LANES];
+
+/// The rows of a moment that a bend's points fill; the last where it is asked for.
+const ALL_ROWS: [usize; SQUARE] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10];
 
 /// A lane of zeros.
 const ZERO: Lane = [0.0; LANES];
@@ -33,6 +36,7 @@ pub struct Adder<'a> {
     locals: &'a [Local],
     tube_radius_mm: f64,
     cutoff_mm: f64,
+    flattening: bool,
     buckets: Vec<Bucket>,
     pass: Pass,
 }
@@ -46,6 +50,7 @@ impl<'a> Adder<'a> {
             locals,
             tube_radius_mm: model.tube_radius_mm,
             cutoff_mm,
+            flattening: model.flattening.is_free(),
             buckets: locals.iter().map(|_| empty()).collect(),
             pass: Pass::empty(locals.len()),
         }
@@ -79,7 +84,7 @@ impl<'a> Adder<'a> {
         let sums = Sums { pass: &mut self.pass, segment, cutoff_mm: self.cutoff_mm, count };
         match &self.locals[segment].arc {
             None => line(bucket, self.tube_radius_mm, sums),
-            Some(arc) => bend(bucket, arc, self.tube_radius_mm, sums),
+            Some(arc) => bend(bucket, arc, self.tube_radius_mm, self.flattening, sums),
         }
     }
 }
@@ -111,8 +116,8 @@ fn line(at: &Bucket, tube_radius_mm: f64, mut sums: Sums) {
 
 /// In the arc's frame, with section coordinates (outward, z) around the spine. The residual's gradient is the section's
 /// radial direction less r'(psi) / rho times the tangential one.
-fn bend(at: &Bucket, arc: &Arc, tube_radius_mm: f64, mut sums: Sums) {
-    let mut h = [ZERO; 10];
+fn bend(at: &Bucket, arc: &Arc, tube_radius_mm: f64, flattening: bool, mut sums: Sums) {
+    let mut h = [ZERO; SQUARE];
     for l in 0..LANES {
         let (x, y, z, ramp) = (at.x[l], at.y[l], at.z[l], at.ramp[l]);
         let qy = y - arc.radius_mm;
@@ -121,8 +126,9 @@ fn bend(at: &Bucket, arc: &Arc, tube_radius_mm: f64, mut sums: Sums) {
         let outward = ring - arc.radius_mm;
         let distance = (outward * outward + z * z).sqrt().max(1e-12);
         let (cos, sin) = (outward / distance, z / distance);
-        let oval = Oval::at(cos, sin, tube_radius_mm, arc.ovality_mm * ramp);
-        let slope = oval.by_direction_mm / distance;
+        let (oval_mm, flat_mm) = (arc.ovality_mm * ramp, arc.flattening_mm * ramp);
+        let outline = Outline::at(cos, sin, tube_radius_mm, oval_mm, flat_mm);
+        let slope = outline.by_direction_mm / distance;
         // Along the section: outward and z components of the gradient.
         let (along_outward, mz) = (cos + slope * sin, sin - slope * cos);
         let (mx, my) = (along_outward * ux, along_outward * uy);
@@ -133,12 +139,14 @@ fn bend(at: &Bucket, arc: &Arc, tube_radius_mm: f64, mut sums: Sums) {
         h[4][l] = x * mz - z * mx;
         h[5][l] = y * mx - x * my;
         h[6][l] = along_outward * (-uy - 1.0);
-        h[7][l] = -ramp * oval.by_oval;
-        h[8][l] = -oval.by_radius;
-        h[9][l] = distance - oval.radius_mm;
+        h[7][l] = -ramp * outline.by_oval;
+        h[8][l] = -outline.by_radius;
+        h[9][l] = distance - outline.radius_mm;
+        h[10][l] = -ramp * outline.by_flat;
     }
     let weights = sums.weigh(&h[9]);
-    sums.square(&h, &weights, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    let rows = if flattening { SQUARE } else { FLATTENING };
+    sums.square(&h[..rows], &weights, &ALL_ROWS[..rows]);
 }
 
 impl Sums<'_> {
@@ -169,14 +177,14 @@ impl Sums<'_> {
     }
 
     /// Adds the weighted products of all pairs to the moment's rows.
-    fn square<const N: usize>(&mut self, h: &[Lane; N], weights: &Lane, rows: &[usize; N]) {
+    fn square(&mut self, h: &[Lane], weights: &Lane, rows: &[usize]) {
         let moment: &mut Moment = &mut self.pass.moments[self.segment];
         for (j, &column) in rows.iter().enumerate() {
             let mut scaled = ZERO;
             for l in 0..LANES {
                 scaled[l] = weights[l] * h[j][l];
             }
-            for i in j..N {
+            for i in j..rows.len() {
                 moment[(rows[i], column)] += dot(&scaled, &h[i]);
             }
         }

@@ -48,6 +48,7 @@ pub struct Arc {
     pub radius_mm: f64,
     pub angle_rad: f64,
     pub ovality_mm: f64,
+    pub flattening_mm: f64,
 }
 
 /// The segments of the model, line, arc, ..., line.
@@ -57,7 +58,8 @@ pub fn prepare(model: &TubeModel) -> Vec<Local> {
         let (mut facing, mut oval) = (Sector::new(0.0, 0.0), Sector::new(0.0, 0.0));
         let arc = match s.kind {
             SegmentKind::Arc { radius_mm, angle_rad } => {
-                let arc = Arc { radius_mm, angle_rad, ovality_mm: model.ovality_mm[k / 2] };
+                let (ovality_mm, flattening_mm) = (model.ovality_mm[k / 2], model.flattening_mm(k / 2));
+                let arc = Arc { radius_mm, angle_rad, ovality_mm, flattening_mm };
                 let full = arc.full_ramp_mm(model.tube_radius_mm) / radius_mm;
                 facing = Sector::new(0.0, angle_rad);
                 oval = Sector::new(full, angle_rad - full);
@@ -185,35 +187,41 @@ impl Local {
         let (u, v) = self.across(p);
         let distance = (u * u + v * v).sqrt().max(1e-12);
         let Some(arc) = &self.arc else { return distance - tube_radius_mm };
-        let oval_mm = arc.ovality_mm * self.ramp_at(p, tube_radius_mm);
-        distance - Oval::at(u / distance, v / distance, tube_radius_mm, oval_mm).radius_mm
+        let ramp = self.ramp_at(p, tube_radius_mm);
+        let (oval_mm, flat_mm) = (arc.ovality_mm * ramp, arc.flattening_mm * ramp);
+        distance - Outline::at(u / distance, v / distance, tube_radius_mm, oval_mm, flat_mm).radius_mm
     }
 }
 
-/// An oval section: an ellipse with half axes radius + oval towards the outside of the bend and radius - oval across.
-pub struct Oval {
+/// The section of a bend: an ellipse with half axes radius + oval towards the outside of the bend and radius - oval across,
+/// with a flattened outer wall.
+pub struct Outline {
     /// The section's radius in a direction.
     pub radius_mm: f64,
-    /// Its derivatives by the tube's radius, by the ovality, and by the direction.
+    /// Its derivatives by the tube's radius, by the ovality, by the flattening, and by the direction.
     pub by_radius: f64,
     /// See `by_radius`.
     pub by_oval: f64,
     /// See `by_radius`.
+    pub by_flat: f64,
+    /// See `by_radius`.
     pub by_direction_mm: f64,
 }
 
-impl Oval {
+impl Outline {
     /// The section in the direction (cos, sin) from the outside of the bend.
-    pub fn at(cos: f64, sin: f64, radius_mm: f64, oval_mm: f64) -> Oval {
+    pub fn at(cos: f64, sin: f64, radius_mm: f64, oval_mm: f64, flat_mm: f64) -> Outline {
+        let (cos_3, sin_3) = ((4.0 * cos * cos - 3.0) * cos, (3.0 - 4.0 * sin * sin) * sin);
         let (a, b) = (radius_mm + oval_mm, radius_mm - oval_mm);
         let square = b * b * cos * cos + a * a * sin * sin;
         let root = square.sqrt();
         let cubic = a * b / (square * root);
-        Oval {
-            radius_mm: a * b / root,
+        Outline {
+            radius_mm: a * b / root + flat_mm * cos_3,
             by_radius: 2.0 * radius_mm / root - cubic * (b * cos * cos + a * sin * sin),
             by_oval: -2.0 * oval_mm / root + cubic * (b * cos * cos - a * sin * sin),
-            by_direction_mm: -cubic * cos * sin * 4.0 * radius_mm * oval_mm,
+            by_flat: cos_3,
+            by_direction_mm: -cubic * cos * sin * 4.0 * radius_mm * oval_mm - 3.0 * flat_mm * sin_3,
         }
     }
 }

@@ -38,6 +38,8 @@ pub(super) struct Values {
     pub corners: Vec<f64>,
     /// Largest less smallest diameter over the nominal one, positive where flattened in the bend's plane.
     pub ovalities: Vec<f64>,
+    /// How far the outer wall lies within the oval section over the nominal diameter.
+    pub flattenings: Vec<f64>,
     pub tube_radius: Vec<f64>,
 }
 
@@ -59,7 +61,8 @@ pub fn measure(
     sigma.radii.iter_mut().for_each(|s| *s *= radius_doubt);
     let n = fit.model.lra.bends.len();
     let oval = (0..n).map(|i| fit.model.may_be_oval(i)).collect();
-    let mut report = Report { sigma, at, oval, ends, first, last, warnings: Vec::new() };
+    let flattened = fit.model.flattening.is_free();
+    let mut report = Report { sigma, at, oval, flattened, ends, first, last, warnings: Vec::new() };
     let bends = (0..n).map(|i| report.bend(i)).collect();
     let last_length = report.length(n);
     let corners: Vec<Option<(f64, f64)>> = (0..=n).map(|i| report.corner(i)).collect();
@@ -100,6 +103,8 @@ struct Report {
     sigma: Values,
     /// Whether a bend is long enough to tell how oval it is.
     oval: Vec<bool>,
+    /// Whether outer walls are flattened.
+    flattened: bool,
     ends: Ends,
     first: Option<End>,
     last: Option<End>,
@@ -114,6 +119,9 @@ impl Report {
         // Less certain than this it says nothing of the bend's quality; no warning, since nothing else depends on it.
         let ovality = Some((self.at.ovalities[i], self.sigma.ovalities[i]));
         let ovality = ovality.filter(|(_, sigma)| *sigma < MAX_OVALITY_SIGMA && self.oval[i]);
+        let flattening = Some((self.at.flattenings[i], self.sigma.flattenings[i]));
+        let told = self.oval[i] && self.flattened;
+        let flattening = flattening.filter(|(_, sigma)| *sigma < MAX_OVALITY_SIGMA && told);
         MeasuredBend {
             length_mm: length.map(|l| l.0),
             length_sigma_mm: length.map(|l| l.1),
@@ -125,6 +133,8 @@ impl Report {
             radius_sigma_mm: radius.map(|r| r.1),
             ovality: ovality.map(|o| o.0),
             ovality_sigma: ovality.map(|o| o.1),
+            flattening: flattening.map(|f| f.0),
+            flattening_sigma: flattening.map(|f| f.1),
         }
     }
 
@@ -265,6 +275,7 @@ pub(super) fn values(model: &TubeModel, ends: &Ends) -> Values {
         angles: model.lra.bends.iter().map(|b| b.angle_rad).collect(),
         radii: model.lra.bends.iter().map(|b| b.radius_mm).collect(),
         ovalities: model.ovality_mm.iter().map(|e| -2.0 * e / model.tube_radius_mm).collect(),
+        flattenings: (0..n).map(|i| -0.5 * model.flattening_mm(i) / model.tube_radius_mm).collect(),
         tube_radius: vec![model.tube_radius_mm],
         lengths,
     }
@@ -285,6 +296,7 @@ impl Values {
             &self.radii,
             &self.corners,
             &self.ovalities,
+            &self.flattenings,
             &self.tube_radius,
         ];
         parts.into_iter().flatten().copied().collect()
@@ -301,6 +313,7 @@ impl Values {
             radii: take(&self.radii),
             corners: take(&self.corners),
             ovalities: take(&self.ovalities),
+            flattenings: take(&self.flattenings),
             tube_radius: take(&self.tube_radius),
         }
     }

@@ -20,6 +20,7 @@ mod evidence;
 mod face;
 pub mod finish;
 pub mod fit;
+mod flattening;
 mod follow;
 mod guided;
 mod lanes;
@@ -60,9 +61,9 @@ use nalgebra::Point3;
 
 use crate::cloud::PointCloud;
 use crate::tube::{Decision, Lra, MeasuredTube, Nominal, Spine};
-use model::TubeModel;
+use model::{Flattening, TubeModel};
 use scene::Scene;
-use structure::Shown;
+use structure::{Shown, Structure};
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -82,6 +83,8 @@ pub struct Reconstruction {
     pub spine: Spine,
     /// How oval each bend's section is, see [`TubeModel::ovality_mm`].
     pub ovality_mm: Vec<f64>,
+    /// How flat each bend's outer wall is, see [`model::Flattening`]; empty where none is.
+    pub flattening_mm: Vec<f64>,
 }
 
 impl Reconstruction {
@@ -90,6 +93,10 @@ impl Reconstruction {
         let start = self.spine.frame_at(0.0);
         let mut model = TubeModel::round(start, self.lra.clone(), self.measured.tube_radius_mm);
         model.ovality_mm.clone_from(&self.ovality_mm);
+        if !self.flattening_mm.is_empty() {
+            model.flattening =
+                Flattening::Free { bends_mm: self.flattening_mm.clone(), spread_mm: f64::INFINITY };
+        }
         whole::residuals_mm(cloud, &model)
     }
 }
@@ -101,6 +108,9 @@ const SAMPLE_CELL_RADII: f64 = 0.12;
 pub fn sample(scene: &Scene) -> Vec<Point3<f64>> {
     scene.thin.thinned(SAMPLE_CELL_RADII * scene.radius_mm).iter().collect()
 }
+
+/// Searches with flattened outer walls at most.
+const FLATTENINGS: usize = 3;
 
 /// What [`reconstruct_watched`] begins, for those who wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -136,6 +146,22 @@ pub fn reconstruct_watched(
     }
 }
 
+/// The structure by `guide`, or freely, and notes on it. Flattened outer walls look like other bends: where there are some the
+/// structure is searched again with them known.
+fn choose(shown: &mut Shown, guide: Option<&Nominal>) -> Option<(Structure, Vec<String>)> {
+    let once = |shown: &Shown| match guide {
+        Some(nominal) => guided::choose(shown, nominal),
+        None => structure::choose(shown).map(|s| (s, Vec::new())),
+    };
+    let mut found = once(shown)?;
+    for _ in 0..FLATTENINGS {
+        let Some(walls) = flattening::walls(shown.sample, &found.0) else { break };
+        shown.flattening = Flattening::Known(walls);
+        found = once(shown)?;
+    }
+    Some(found)
+}
+
 /// Works on one of the pool's threads: from outside each of hundreds of short parallel loops would wait to be taken up.
 fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
@@ -158,18 +184,14 @@ fn by(
         most: structure::MOST_BENDS,
     };
     begins(Stage::Structure);
-    let choose = |shown: &Shown| match guide {
-        Some(nominal) => guided::choose(shown, nominal),
-        None => structure::choose(shown).map(|s| (s, Vec::new())),
-    };
     let mut shown = Shown::new(cloud, &scene, &sample);
-    let (mut chosen, mut notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
+    let (mut chosen, mut notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
     let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, &chosen));
     let again =
         (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
     if let Some(again) = &again {
         shown = Shown { whole: shown.whole.moved(&passes), sample: again, ..shown };
-        (chosen, notes) = in_pool(|| choose(&shown)).ok_or_else(not_bent)?;
+        (chosen, notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
         let what = format!("{} passes of the scan moved onto each other", passes.len());
         chosen.decisions.push(Decision { what, bend: None, gain, kept: true });
     }

@@ -6,7 +6,7 @@
 
 use nalgebra::{DVector, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
-use super::moments::{OVALITY, OWN_RADIUS, TUBE_RADIUS};
+use super::moments::{FLATTENING, OVALITY, OWN_RADIUS, TUBE_RADIUS};
 use crate::recognize::median;
 use crate::tube::{Frame, Lra, SegmentKind, Spine, wrap_angle};
 
@@ -22,8 +22,45 @@ pub struct TubeModel {
     /// How oval each bend's section is: its radius is the tube's plus this times cos 2 psi, psi from the outside of the
     /// bend; negative where the bend is flattened, as is usual.
     pub ovality_mm: Vec<f64>,
+    /// How flat the outer walls of the bends are.
+    pub flattening: Flattening,
     /// One radius for all bends (one die) instead of one each.
     pub common_radius: bool,
+}
+
+/// Flattened outer walls: the section's radius has a bend's value times cos 3 psi more, psi from the outside of the bend;
+/// negative where the outer wall lies within the oval section and its two shoulders without.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Flattening {
+    /// No free values: each bend has that of the wall that was seen nearest to it; 0 as long as none was.
+    Known(Vec<Wall>),
+    /// Each bend's own, and free.
+    Free {
+        /// The bends' values.
+        bends_mm: Vec<f64>,
+        /// Standard deviation that is expected of them: a bend that does not tell its own is taken to be about as flat as those
+        /// that do.
+        spread_mm: f64,
+    },
+}
+
+/// A flattened outer wall that was seen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wall {
+    /// Middle of the bend.
+    pub at: Point3<f64>,
+    /// Its value.
+    pub flat_mm: f64,
+}
+
+impl Flattening {
+    /// Outer walls as round as the section.
+    pub const NONE: Flattening = Flattening::Known(Vec::new());
+
+    /// Whether each bend has its own value.
+    pub fn is_free(&self) -> bool {
+        matches!(self, Flattening::Free { .. })
+    }
 }
 
 /// One free value of the model.
@@ -43,6 +80,8 @@ pub enum Parameter {
     CommonRadius,
     /// Ovality of bend i.
     Ovality(usize),
+    /// Flattening of bend i.
+    Flattening(usize),
     /// Outer radius of the tube.
     TubeRadius,
 }
@@ -90,7 +129,14 @@ impl TubeModel {
     /// A tube of round section with a radius for every bend.
     pub fn round(start: Frame, lra: Lra, tube_radius_mm: f64) -> TubeModel {
         let ovality_mm = vec![0.0; lra.bends.len()];
-        TubeModel { start, lra, tube_radius_mm, ovality_mm, common_radius: false }
+        TubeModel {
+            start,
+            lra,
+            tube_radius_mm,
+            ovality_mm,
+            flattening: Flattening::NONE,
+            common_radius: false,
+        }
     }
 
     /// The free values in their order.
@@ -109,6 +155,7 @@ impl TubeModel {
             }
             if self.may_be_oval(i) {
                 all.push(Parameter::Ovality(i));
+                all.extend(self.flattening.is_free().then_some(Parameter::Flattening(i)));
             }
         }
         if self.common_radius && n > 0 {
@@ -148,6 +195,28 @@ impl TubeModel {
         Spine::from_lra(&self.lra, self.start)
     }
 
+    /// How flat the outer wall of bend i is: its value of [`Flattening`].
+    pub fn flattening_mm(&self, i: usize) -> f64 {
+        match &self.flattening {
+            Flattening::Free { bends_mm, .. } => bends_mm[i],
+            Flattening::Known(walls) if !walls.is_empty() && self.may_be_oval(i) => {
+                let middle = self.middle(i);
+                let nearest = walls
+                    .iter()
+                    .min_by(|a, b| (a.at - middle).norm_squared().total_cmp(&(b.at - middle).norm_squared()));
+                nearest.map_or(0.0, |wall| wall.flat_mm)
+            }
+            Flattening::Known(_) => 0.0,
+        }
+    }
+
+    /// The middle of bend i.
+    pub fn middle(&self, i: usize) -> Point3<f64> {
+        let spine = self.spine();
+        let arc = &spine.segments()[2 * i + 1];
+        arc.frame_at(0.5 * arc.length_mm).translation.vector.into()
+    }
+
     /// How the parameters move the tube. The segments are the spine's: line, arc, ..., line.
     pub fn columns(&self, parameters: &[Parameter]) -> Vec<Column> {
         // In the start frame: its axes carry the pose parameters.
@@ -165,6 +234,9 @@ impl TubeModel {
         out.tube_radius_mm = out.tube_radius_mm.clamp(0.5 * self.tube_radius_mm, 2.0 * self.tube_radius_mm);
         let most_oval = MOST_OVAL * out.tube_radius_mm;
         out.ovality_mm.iter_mut().for_each(|e| *e = e.clamp(-most_oval, most_oval));
+        if let Flattening::Free { bends_mm, .. } = &mut out.flattening {
+            bends_mm.iter_mut().for_each(|g| *g = g.clamp(-most_oval, most_oval));
+        }
         for b in &mut out.lra.bends {
             b.length_mm = b.length_mm.max(0.0);
             b.rotation_rad = wrap_angle(b.rotation_rad);
@@ -187,6 +259,11 @@ impl TubeModel {
                 Parameter::BendRadius(i) => out.lra.bends[i].radius_mm += d,
                 Parameter::CommonRadius => out.lra.bends.iter_mut().for_each(|b| b.radius_mm += d),
                 Parameter::Ovality(i) => out.ovality_mm[i] += d,
+                Parameter::Flattening(i) => {
+                    if let Flattening::Free { bends_mm, .. } = &mut out.flattening {
+                        bends_mm[i] += d;
+                    }
+                }
                 Parameter::TubeRadius => out.tube_radius_mm += d,
             }
         }
@@ -226,6 +303,7 @@ fn motions(parameter: &Parameter, spine: &Spine) -> Vec<Motion> {
         Parameter::BendRadius(i) => bend_radius(spine, i).into(),
         Parameter::CommonRadius => (0..segments.len() / 2).flat_map(|i| bend_radius(spine, i)).collect(),
         Parameter::Ovality(i) => vec![Motion::Own { segment: 2 * i + 1, row: OVALITY }],
+        Parameter::Flattening(i) => vec![Motion::Own { segment: 2 * i + 1, row: FLATTENING }],
         Parameter::TubeRadius => vec![Motion::Everywhere { row: TUBE_RADIUS }],
     }
 }

@@ -2,9 +2,9 @@
 //!
 //! A rigid twist of the tube changes a point's distance by the product of its normal line's Plücker coordinates
 //! (m, p x m) with the twist (paper 004, section 2). So a point's Jacobian row is that six-vector times the
-//! segment's twist matrix, plus three columns of its own: the arc's CLR, its ovality and the tube's radius. The sum of
-//! their outer products per segment, ten numbers squared, is all of the points that the normal equations need: a
-//! pass costs O(points) whatever the number of bends.
+//! segment's twist matrix, plus a few columns of its own: the arc's CLR, its ovality, the tube's radius and, where it is
+//! asked for, the arc's flattening. The sum of their outer products per segment, eleven numbers squared, is all of the
+//! points that the normal equations need: a pass costs O(points) whatever the number of bends.
 //!
 //! Sums run over chunks of fixed size and are added in order: the result does not depend on the threads.
 
@@ -24,7 +24,8 @@ const ON_SURFACE: f64 = 0.1;
 /// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
 pub const ROWS: usize = 9;
 
-/// Places of the other derivatives and of the residual in a moment.
+/// Places of the other derivatives and of the residual in a moment. The flattening comes last: only the last fit may ask
+/// for it.
 pub const OWN_RADIUS: usize = 6;
 /// See [`OWN_RADIUS`].
 pub const OVALITY: usize = 7;
@@ -32,9 +33,13 @@ pub const OVALITY: usize = 7;
 pub const TUBE_RADIUS: usize = 8;
 /// See [`OWN_RADIUS`].
 pub const RESIDUAL: usize = 9;
+/// See [`OWN_RADIUS`].
+pub const FLATTENING: usize = 10;
+/// Rows of a moment.
+pub const SQUARE: usize = 11;
 
 /// The derivatives and the residual, squared.
-pub type Moment = SMatrix<f64, 10, 10>;
+pub type Moment = SMatrix<f64, SQUARE, SQUARE>;
 
 /// The sums of one pass.
 #[derive(Debug, Clone)]
@@ -213,6 +218,7 @@ impl Pass {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::reconstruct::model::Flattening;
     use crate::reconstruct::normal;
     use crate::tube::{Bend, Frame, Lra};
     use nalgebra::{DVector, Vector3};
@@ -237,6 +243,7 @@ mod tests {
             },
             tube_radius_mm: 10.0,
             ovality_mm: vec![-0.4, 0.3, -0.2],
+            flattening: Flattening::Free { bends_mm: vec![-0.2, -0.3, 0.0], spread_mm: 0.3 },
             common_radius,
         }
     }
@@ -286,7 +293,7 @@ mod tests {
 
         #[test]
         fn settling_from_any_start_finds_the_distance(along in 0.0..1.0f64, around in 0.0..std::f64::consts::TAU, off in -1.0..1.0f64) {
-            let model = TubeModel { ovality_mm: vec![0.0; 3], ..model(false) };
+            let model = TubeModel { ovality_mm: vec![0.0; 3], flattening: Flattening::NONE, ..model(false) };
             let p = near_surface(&model, along, around, off);
             let mut sample = Sample::new(vec![p], &model);
             let residual = sample.residuals(&model)[0];

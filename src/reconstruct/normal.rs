@@ -7,7 +7,7 @@
 use nalgebra::{DMatrix, DVector, Matrix6, SMatrix, Vector6};
 
 use super::model::{Motion, Parameter, TubeModel, in_frame};
-use super::moments::{Moment, RESIDUAL, ROWS};
+use super::moments::{Moment, RESIDUAL, SQUARE};
 use crate::tube::{Frame, Spine};
 
 /// Sums over a part of the tube, twists seen from the start frame.
@@ -15,12 +15,13 @@ use crate::tube::{Frame, Spine};
 pub struct Part {
     /// Twist against twist.
     pub square: Matrix6<f64>,
-    /// Twist against every column of the moment (its own values, tube radius, residual).
-    pub mixed: SMatrix<f64, 6, 4>,
+    /// Twist against every column of the moment that is none (its own values, tube radius, residual).
+    pub mixed: SMatrix<f64, 6, NO_TWIST>,
 }
 
 /// First of the columns of a moment that are no twist.
 const OWN: usize = 6;
+const NO_TWIST: usize = SQUARE - OWN;
 
 impl Part {
     /// Nothing yet.
@@ -33,7 +34,7 @@ impl Part {
         let seen = to_segment(frame);
         Part {
             square: seen.transpose() * moment.fixed_view::<6, 6>(0, 0) * seen,
-            mixed: seen.transpose() * moment.fixed_view::<6, 4>(0, OWN),
+            mixed: seen.transpose() * moment.fixed_view::<6, NO_TWIST>(0, OWN),
         }
     }
 
@@ -137,5 +138,3 @@ pub fn to_segment(frame: &Frame) -> Matrix6<f64> {
     };
     Matrix6::from_columns(&[0, 1, 2, 3, 4, 5].map(column))
 }
-
-const _: () = assert!(RESIDUAL == ROWS && ROWS == OWN + 3);

@@ -10,7 +10,7 @@ use nalgebra::{Cholesky, Matrix2, Matrix5, Point3, SMatrix, Vector2, Vector3, Ve
 use rayon::prelude::*;
 
 use super::fit::Data;
-use super::local::{Arc, Local, Oval, prepare, settle};
+use super::local::{Arc, Local, Outline, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
 use super::section::{
@@ -19,7 +19,7 @@ use super::section::{
 };
 use super::strangers::{Crowded, Strangers, beset, is_at_an_end, is_oval_untold};
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
-use crate::tube::{Spine, any_normal};
+use crate::tube::{Bend, Spine, any_normal};
 
 /// The same about a base that has been fitted, radius and ovality and all.
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
@@ -177,7 +177,7 @@ impl CentreLine {
                 continue;
             }
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
-            let oval_mm = [oval(base, place, along), 0.0];
+            let oval_mm = [uneven(base, place, along).0, 0.0];
             doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, at_mm));
             let best = solve(&sums, &SPREADS.map(|s| s * base.tube_radius_mm), noise);
             let least = cost(&sums, &best).max(0.0);
@@ -263,7 +263,9 @@ impl CentreLine {
     pub fn moments(&self, model: &TubeModel) -> Vec<(usize, Moment)> {
         let mut out = Vec::with_capacity(self.sections.len());
         self.walk(model, |section, segment, values, derivatives| {
-            out.push((segment, moment(&section.sums, values, derivatives)));
+            let mut moment = Moment::zeros();
+            add_moment(&mut moment, &section.sums, values, derivatives);
+            out.push((segment, moment));
         });
         out
     }
@@ -305,9 +307,7 @@ impl Data for CentreLine {
     fn pass(&mut self, model: &TubeModel, _cutoff_mm: f64) -> Pass {
         let mut pass = Pass::empty(2 * model.lra.bends.len() + 1);
         self.walk(model, |section, segment, values, derivatives| {
-            let moment = moment(&section.sums, values, derivatives);
-            pass.cost += 0.5 * moment[(RESIDUAL, RESIDUAL)];
-            pass.moments[segment] += moment;
+            pass.cost += 0.5 * add_moment(&mut pass.moments[segment], &section.sums, values, derivatives);
         });
         pass
     }
@@ -352,8 +352,13 @@ fn predict(
     (values, derivatives)
 }
 
-/// The moment of a section at the values that a model predicts.
-fn moment(sums: &Sums, values: &Values, derivatives: &SMatrix<f64, VALUES, ROWS>) -> Moment {
+/// Adds the moment of a section at the values that a model predicts; returns their cost.
+fn add_moment(
+    out: &mut Moment,
+    sums: &Sums,
+    values: &Values,
+    derivatives: &SMatrix<f64, VALUES, ROWS>,
+) -> f64 {
     let square: Matrix5<f64> = sums.fixed_view::<VALUES, VALUES>(0, 0).into_owned();
     let mixed: Values = sums.fixed_view::<VALUES, 1>(0, VALUES).into_owned();
     // The residual falls as the values grow.
@@ -361,18 +366,21 @@ fn moment(sums: &Sums, values: &Values, derivatives: &SMatrix<f64, VALUES, ROWS>
     // Each row of the moment moves some of the values only: twists and CLR the place across, the others one value.
     let (across, oval) =
         (derivatives.fixed_view::<2, OVALITY>(1, 0), derivatives.fixed_view::<2, 1>(3, OVALITY));
-    let mut seen = SMatrix::<f64, VALUES, 10>::zeros();
+    let mut seen = SMatrix::<f64, VALUES, ROWS>::zeros();
     seen.fixed_columns_mut::<OVALITY>(0).copy_from(&(square.fixed_columns::<2>(1) * across));
     seen.set_column(OVALITY, &(square.fixed_columns::<2>(3) * oval));
     seen.set_column(TUBE_RADIUS, &square.column(0));
-    seen.set_column(RESIDUAL, &left);
-    let mut out = Moment::zeros();
-    out.fixed_rows_mut::<OVALITY>(0).copy_from(&(across.transpose() * seen.fixed_rows::<2>(1)));
-    out.set_row(OVALITY, &(oval.transpose() * seen.fixed_rows::<2>(3)));
-    out.set_row(TUBE_RADIUS, &seen.row(0));
-    out.set_row(RESIDUAL, &out.column(RESIDUAL).transpose());
-    out[(RESIDUAL, RESIDUAL)] = cost(sums, values);
-    out
+    let mut rows = out.fixed_view_mut::<OVALITY, ROWS>(0, 0);
+    rows += across.transpose() * seen.fixed_rows::<2>(1);
+    let mut row = out.fixed_view_mut::<1, ROWS>(OVALITY, 0);
+    row += oval.transpose() * seen.fixed_rows::<2>(3);
+    let mut row = out.fixed_view_mut::<1, ROWS>(TUBE_RADIUS, 0);
+    row += seen.row(0);
+    let mut row = out.fixed_view_mut::<1, ROWS>(RESIDUAL, 0);
+    row += left.transpose() * derivatives;
+    let cost = cost(sums, values);
+    out[(RESIDUAL, RESIDUAL)] += cost;
+    cost
 }
 
 /// Sums of a section's points, weighted by the biweight about its own fit.
@@ -460,15 +468,18 @@ fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
 }
 
-/// Ovality of the base tube at a place of a segment, from the outside of its bend.
-fn oval(base: &TubeModel, segment: usize, along_mm: f64) -> f64 {
+/// How oval the base tube is at a place of a segment, and how flat its outer wall.
+fn uneven(base: &TubeModel, segment: usize, along_mm: f64) -> (f64, f64) {
     match base.lra.bends.get(segment / 2).filter(|_| segment % 2 == 1) {
         Some(bend) => {
-            let e = base.ovality_mm[segment / 2];
-            let arc = Arc { radius_mm: bend.radius_mm, angle_rad: bend.angle_rad, ovality_mm: e };
-            e * arc.ramp(along_mm / bend.radius_mm, base.tube_radius_mm)
+            let ovality_mm = base.ovality_mm[segment / 2];
+            let Bend { radius_mm, angle_rad, .. } = *bend;
+            let flattening_mm = base.flattening_mm(segment / 2);
+            let arc = Arc { radius_mm, angle_rad, ovality_mm, flattening_mm };
+            let ramp = arc.ramp(along_mm / radius_mm, base.tube_radius_mm);
+            (ovality_mm * ramp, flattening_mm * ramp)
         }
-        None => 0.0,
+        None => (0.0, 0.0),
     }
 }
 
@@ -495,8 +506,10 @@ fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
             let k = segment as usize;
             let along_mm = locals[k].unclamped_along_mm(&local);
             let (cos, sin) = (off.x / distance, off.y / distance);
-            let round = Oval::at(cos, sin, base.tube_radius_mm, oval(base, k, along_mm));
-            let residual_mm = distance - round.radius_mm;
+            let (oval_mm, flat_mm) = uneven(base, k, along_mm);
+            // From the outside of the bend, which is the other way.
+            let outline = Outline::at(-cos, sin, base.tube_radius_mm, oval_mm, flat_mm);
+            let residual_mm = distance - outline.radius_mm;
             let section = bins.of(k, along_mm / locals[k].length_mm.max(1e-12)) as u32;
             Some(Seen { section, along_mm, cos, sin, residual_mm })
         };

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::arcline::{Limits, approximate};
 use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
-use super::model::{Parameter, TubeModel};
+use super::model::{Flattening, Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::{
     is_free_form, mean_radius_mm, merged, shallow_pairs, with_common_radius, with_wide_doubled, without_bend,
@@ -56,7 +56,7 @@ const UNCONFIRMED_RADII: f64 = 2.0;
 const MEASUREMENTS: usize = 4;
 
 /// What a structure is searched on.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Shown<'a> {
     /// Vertices along the centre line.
     pub polygon: &'a [Point3<f64>],
@@ -64,6 +64,8 @@ pub struct Shown<'a> {
     pub sample: &'a [Point3<f64>],
     /// Tube radius, good to about a hundredth.
     pub radius_mm: f64,
+    /// How flat the outer walls of the bends are, as far as is known.
+    pub flattening: Flattening,
     /// All of the tube's points as they lie in the file.
     pub whole: Whole<'a>,
 }
@@ -72,7 +74,13 @@ impl<'a> Shown<'a> {
     /// What a scene shows of the tube in its cloud.
     pub fn new(cloud: &'a PointCloud, scene: &'a Scene, sample: &'a [Point3<f64>]) -> Shown<'a> {
         let whole = Whole::new(cloud, scene.own.as_deref());
-        Shown { polygon: &scene.polygon, sample, radius_mm: scene.radius_mm, whole }
+        Shown {
+            polygon: &scene.polygon,
+            sample,
+            radius_mm: scene.radius_mm,
+            flattening: Flattening::NONE,
+            whole,
+        }
     }
 }
 
@@ -99,7 +107,7 @@ pub struct Structure {
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(shown: &Shown) -> Option<Structure> {
-    let Shown { polygon, sample, radius_mm, whole } = *shown;
+    let Shown { polygon, sample, radius_mm, whole, .. } = *shown;
     let mut jury = Jury {
         line: CentreLine::of_polygon(polygon, radius_mm),
         correlation: 1.0,
@@ -107,8 +115,11 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         decisions: Vec::new(),
         undecided: Undecided::new(),
     };
-    let starts: Vec<TubeModel> =
-        TOLERANCES.par_iter().filter_map(|t| start(polygon, t * radius_mm, radius_mm)).collect();
+    let start = |tolerance: &f64| {
+        let model = start(polygon, tolerance * radius_mm, radius_mm)?;
+        Some(TubeModel { flattening: shown.flattening.clone(), ..model })
+    };
+    let starts: Vec<TubeModel> = TOLERANCES.par_iter().filter_map(start).collect();
     let mut rough: Vec<Candidate> =
         starts.par_iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
     rough.sort_by(|a, b| a.score.total_cmp(&b.score));

@@ -88,9 +88,11 @@ fn head(page: &mut String, about: &About, tube: &MeasuredTube, scale: &Scale) ->
 
 fn table(page: &mut String, tube: &MeasuredTube) -> Result {
     let oval = tube.bends.iter().any(|b| b.ovality.is_some());
+    let flattened = tube.bends.iter().any(|b| b.flattening.is_some());
     writeln!(page, "<section>\n<h2>Bending table (LRA)</h2>\n<table>\n<tr><th class=\"words\">bend</th>")?;
     writeln!(page, "<th>length, mm</th><th>rotation, °</th><th>angle, °</th><th>CLR, mm</th>")?;
-    writeln!(page, "{}</tr>", if oval { "<th>ovality, %</th>" } else { "" })?;
+    page.push_str(if oval { "<th>ovality, %</th>" } else { "" });
+    writeln!(page, "{}</tr>", if flattened { "<th>flattening, %</th>" } else { "" })?;
     for (i, b) in tube.bends.iter().enumerate() {
         let degrees = |rad: Option<f64>| rad.map(f64::to_degrees);
         let percent = |share: Option<f64>| share.map(|s| 100.0 * s);
@@ -101,10 +103,11 @@ fn table(page: &mut String, tube: &MeasuredTube) -> Result {
             sigma(b.radius_mm, b.radius_sigma_mm, 3),
         ];
         cells.extend(oval.then(|| sigma(percent(b.ovality), percent(b.ovality_sigma), 2)));
+        cells.extend(flattened.then(|| sigma(percent(b.flattening), percent(b.flattening_sigma), 2)));
         writeln!(page, "<tr><td class=\"words\">{}</td><td>{}</td></tr>", i + 1, cells.join("</td><td>"))?;
     }
     let last = sigma(tube.last_length_mm, tube.last_length_sigma_mm, 3);
-    let empty = "<td></td>".repeat(3 + usize::from(oval));
+    let empty = "<td></td>".repeat(3 + usize::from(oval) + usize::from(flattened));
     writeln!(page, "<tr><td class=\"words\">end</td><td>{last}</td>{empty}</tr>\n</table>")?;
     let cuts = [
         ("first", tube.first_cut_rad, tube.first_cut_sigma_rad),

@@ -18,6 +18,9 @@ use crate::tube::{Bend, Frame, Lra, Spine};
 
 pub use hard::{Scene, random_scene};
 
+/// Outer walls are flattened by no more than this share of the diameter.
+const MOST_FLATTENED: f64 = 0.01;
+
 /// One member of the population: the tube and how it is scanned.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Specimen {
@@ -53,6 +56,18 @@ pub fn random_tube(seed: u64) -> Specimen {
     let settings = ScanSettings { density, sight: Some(sight), ..ScanSettings::default() };
     let shape = TubeShape { ovality, ..TubeShape::round(lra, 2.0 * radius_mm) };
     Specimen { shape, settings, common_clr }
+}
+
+/// The tube of [`random_tube`] as bends without a mandrel come out: every section oval by up to 6 %, every outer wall flattened
+/// by up to 1 % of the diameter, each bend its own way; scanned the same way.
+pub fn flattened_tube(seed: u64) -> Specimen {
+    let specimen = random_tube(seed);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(2);
+    let mut drawn =
+        |most: f64| specimen.shape.lra.bends.iter().map(|_| rng.random_range(0.0..most)).collect();
+    let (ovality, flattening) = (drawn(0.06), drawn(MOST_FLATTENED));
+    Specimen { shape: TubeShape { ovality, flattening, ..specimen.shape.clone() }, ..specimen }
 }
 
 /// The tube of paper 000's Results (section 8), as far as it is described there: radius 4 mm, 268 mm long, 5 bends, 6005

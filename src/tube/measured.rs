@@ -40,6 +40,13 @@ pub struct MeasuredBend {
     /// Its sigma.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ovality_sigma: Option<f64>,
+    /// How far the outer wall of the section half way through the bend lies within the ellipse, over the nominal diameter:
+    /// positive where it is flattened (as it is without a mandrel). Not there where no bend of the tube shows any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flattening: Option<f64>,
+    /// Its sigma.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flattening_sigma: Option<f64>,
 }
 
 /// A choice about the tube's structure (a bend more or fewer, one CLR for all) and what spoke for it, so that a
@@ -150,6 +157,8 @@ impl MeasuredTube {
             radius_sigma_mm: Some(0.0),
             ovality: None,
             ovality_sigma: None,
+            flattening: None,
+            flattening_sigma: None,
         };
         let corners = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
         MeasuredTube {

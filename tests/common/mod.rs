@@ -20,6 +20,8 @@ pub fn measured(lra: &Lra, angle_sigma_deg: f64) -> MeasuredTube {
             radius_sigma_mm: Some(0.08),
             ovality: None,
             ovality_sigma: None,
+            flattening: None,
+            flattening_sigma: None,
         }
     };
     let intersection_mm = lra.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);

@@ -38,6 +38,9 @@ pub struct TubeShape {
     /// Per bend, (largest - smallest diameter) / nominal diameter: 0 is round, missing ones are 0. The tube flattens
     /// in the plane of the bend.
     pub ovality: Vec<f64>,
+    /// Per bend, how far the outer wall lies within the ellipse over the nominal diameter: 0 is none, missing ones are 0. Its
+    /// shoulders, 60 degrees to either side, bulge as far.
+    pub flattening: Vec<f64>,
     /// Thickness of the wall: light returns from the end faces and from the bore close to them. 0 is a tube whose open
     /// ends return nothing.
     pub wall_mm: f64,
@@ -48,7 +51,8 @@ pub struct TubeShape {
 impl TubeShape {
     /// A tube with round sections throughout and clean, square, dark ends.
     pub fn round(lra: Lra, od_mm: f64) -> TubeShape {
-        TubeShape { lra, od_mm, ovality: Vec::new(), wall_mm: 0.0, ends: [EndShape::default(); 2] }
+        let ends = [EndShape::default(); 2];
+        TubeShape { lra, od_mm, ovality: Vec::new(), flattening: Vec::new(), wall_mm: 0.0, ends }
     }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! The surface is where the distance to the centre line equals the section's radius. A ray advances by that
 //! distance (it cannot pass the surface) until it is close, then Newton's method finds the root. In a bend the
-//! section is an ellipse flattened in the bend's plane, growing out of the circle within a radius of arc. Both ends are
+//! section is an ellipse flattened in the bend's plane, its outer wall flatter still, growing out of the circle within a
+//! radius of arc. Both ends are
 //! clipped (`end`); with a wall the tube is hollow, and light returns from the faces and from the bore close to them.
 
 use std::f64::consts::PI;
@@ -63,6 +64,7 @@ struct Arc {
     radius_mm: f64,
     angle_rad: f64,
     ovality: f64,
+    flattening: f64,
 }
 
 /// A part of the tube within a ball: what rays near it must be tested against.
@@ -110,8 +112,9 @@ impl Solid {
                 SegmentKind::Line => None,
                 SegmentKind::Arc { radius_mm, angle_rad } => {
                     bend += 1;
-                    let ovality = shape.ovality.get(bend - 1).copied().unwrap_or(0.0);
-                    Some(Arc { radius_mm, angle_rad, ovality })
+                    let of = |bends: &[f64]| bends.get(bend - 1).copied().unwrap_or(0.0);
+                    let (ovality, flattening) = (of(&shape.ovality), of(&shape.flattening));
+                    Some(Arc { radius_mm, angle_rad, ovality, flattening })
                 }
             };
             if segment.length_mm > 0.0 {
@@ -132,7 +135,8 @@ impl Solid {
         if let Some(last) = pieces.last_mut().filter(|p| p.arc.is_none()) {
             last.length_mm += ends[1].overhang_mm();
         }
-        let steepest = shape.ovality.iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+        let most = |bends: &[f64]| bends.iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+        let steepest = most(&shape.ovality) + 3.0 * most(&shape.flattening);
         Solid {
             pieces,
             ends,
@@ -289,14 +293,18 @@ impl Arc {
     /// Radius of the section towards (outward in the bend's plane, across it), at a turn along the bend.
     fn section_mm(&self, outward: f64, across: f64, turn: f64, radius_mm: f64) -> f64 {
         let distance = outward.hypot(across);
-        if self.ovality == 0.0 || distance == 0.0 {
+        if (self.ovality == 0.0 && self.flattening == 0.0) || distance == 0.0 {
             return radius_mm;
         }
         let ramp_mm = radius_mm.min(self.radius_mm * self.angle_rad / 2.0);
         let from_end_mm = self.radius_mm * turn.min(self.angle_rad - turn);
         let x = (from_end_mm / ramp_mm).clamp(0.0, 1.0);
-        let ovality = self.ovality * x * x * (3.0 - 2.0 * x);
+        let share = x * x * (3.0 - 2.0 * x);
+        let ovality = self.ovality * share;
         let (flat, tall) = (1.0 - ovality / 2.0, 1.0 + ovality / 2.0);
-        radius_mm * flat * tall * distance / (tall * outward).hypot(flat * across)
+        let ellipse_mm = radius_mm * flat * tall * distance / (tall * outward).hypot(flat * across);
+        let cos = outward / distance;
+        let three_sided = cos * (4.0 * cos * cos - 3.0);
+        ellipse_mm - 2.0 * radius_mm * self.flattening * share * three_sided
     }
 }

@@ -4,7 +4,7 @@ use nalgebra::Point3;
 
 use crate::reconstruct::Reconstruction;
 use crate::reconstruct::bound::{Bound, cramer_rao};
-use crate::reconstruct::model::TubeModel;
+use crate::reconstruct::model::{Flattening, TubeModel};
 use crate::sim::scan::{PointKind, ScanSettings, SimulatedScan, TubeShape, UnseenEnd};
 use crate::tube::{Lra, MeasuredTube, wrap_angle};
 
@@ -163,10 +163,16 @@ fn true_model(shape: &TubeShape, scanned: &SimulatedScan, common_radius: bool) -
     let radius = shape.od_mm / 2.0;
     // The pose holds the first rotation.
     lra.bends.iter_mut().take(1).for_each(|b| b.rotation_rad = 0.0);
-    let oval = |i: usize| -0.5 * shape.ovality.get(i).copied().unwrap_or(0.0) * radius;
-    let ovality_mm = (0..lra.bends.len()).map(oval).collect();
+    let each = |shares: &[f64], factor: f64| -> Vec<f64> {
+        (0..lra.bends.len()).map(|i| factor * radius * shares.get(i).copied().unwrap_or(0.0)).collect()
+    };
+    let ovality_mm = each(&shape.ovality, -0.5);
+    let flattening = match shape.flattening.is_empty() {
+        true => Flattening::NONE,
+        false => Flattening::Free { bends_mm: each(&shape.flattening, -2.0), spread_mm: f64::INFINITY },
+    };
     let start = scanned.spine.segments()[0].start;
-    TubeModel { common_radius, ovality_mm, ..TubeModel::round(start, lra, radius) }
+    TubeModel { common_radius, ovality_mm, flattening, ..TubeModel::round(start, lra, radius) }
 }
 
 /// The scanned points of the tube's outside: those of the bore say nothing of it.
