@@ -103,6 +103,7 @@ right() {
 Three seeds each that nothing was tuned on: what the tables count is in \`src/trial/accuracy\`.
 $(accuracy thirty --count "${THIRTY:-235}")
 $(accuracy hard --count "${HARD:-230}")
+$(accuracy flattened --count "${FLATTENED:-100}")
 TEXT
 }
 
