@@ -20,6 +20,11 @@ const TOLD_SIGMAS: f64 = 3.5;
 /// A bend whose other values can do all of its flattening but this share tells nothing of it.
 const LEAST_OWN: f64 = 1e-6;
 
+/// No scanner and no noise's mean is true to less than this share of the tube's radius. And how oval a bend becomes at its ends
+/// may look like so much flattening of it, in a bend that is a radius long.
+const SLIGHT: f64 = 3e-4;
+const OF_OVALITY: f64 = 0.1;
+
 /// Bends differ from the usual by about this share of it.
 const UNLIKE: f64 = 0.5;
 
@@ -60,13 +65,25 @@ pub fn told(data: &mut impl Data, model: &TubeModel, cutoff_mm: f64) -> Option<T
         let curvature = normal[(j, j)] - follows.dot(&normal.column(j).select_rows(&others));
         let slope = gradient[j] - follows.dot(&gradient.select_rows(&others));
         let out = slope.abs() / (curvature * variance).sqrt();
-        if curvature > LEAST_OWN * normal[(j, j)] && out > TOLD_SIGMAS {
+        let size_mm = slope.abs() / curvature;
+        if curvature > LEAST_OWN * normal[(j, j)]
+            && out > TOLD_SIGMAS
+            && size_mm > least_mm(&model, parameters[j])
+        {
             sigmas = sigmas.max(out);
-            largest_mm = largest_mm.max(slope.abs() / curvature);
+            largest_mm = largest_mm.max(size_mm);
         }
     }
     let flattening = Flattening::Free { bends_mm, spread_mm: largest_mm };
     (sigmas > 0.0).then_some(Told { flattening, sigmas })
+}
+
+/// A wall is flattened by no less than this.
+fn least_mm(model: &TubeModel, parameter: Parameter) -> f64 {
+    let Parameter::Flattening(i) = parameter else { return 0.0 };
+    let (radius_mm, bend) = (model.tube_radius_mm, &model.lra.bends[i]);
+    let length_mm = (bend.angle_rad * bend.radius_mm).max(radius_mm);
+    SLIGHT * radius_mm + OF_OVALITY * model.ovality_mm[i].abs() * radius_mm / length_mm
 }
 
 fn is_flattening(parameter: &Parameter) -> bool {
