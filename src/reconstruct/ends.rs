@@ -26,6 +26,9 @@ const RIM_SIGMAS: f64 = 0.3;
 const FEWEST_BEYOND: usize = 8;
 const SHARE_BEYOND: f64 = 0.04;
 const BEYOND_RADII: f64 = 0.15;
+/// An outline more oblique than any saw's by so many standard deviations is the shadow of another leg, or where the scan
+/// stops: these come as often as a saw that is set to its last degree.
+const OBLIQUE_SIGMAS: f64 = 1.5;
 /// What differs by more than this many standard deviations is not the same.
 const DIFFERENT_SIGMAS: f64 = 4.0;
 
@@ -126,7 +129,7 @@ fn goes_on(surface: &[Point3<f64>], outline: &Outline, radius_mm: f64, near_mm: 
 fn by_outline(outline: &Outline, noise_mm: f64) -> End {
     let at_mm = outline.at_mm;
     let slope = outline.loose_size();
-    if slope - DIFFERENT_SIGMAS * outline.loose_sigma > MOST_OBLIQUE {
+    if slope - OBLIQUE_SIGMAS * outline.loose_sigma > MOST_OBLIQUE {
         return End::CutOff { at_mm: outline.loose_at_mm, slope_rad: slope.atan() };
     }
     if outline.agreeing < LEAST_AGREEING {
