@@ -9,8 +9,9 @@ pub const SAW_SPREAD: f64 = 0.0017;
 const MITRE_SPREAD: f64 = 0.07;
 /// Share of the ends that are cut square: a saw that is set for a mitre is the rarer one.
 const SQUARE_SHARE: f64 = 0.85;
-/// So many standard deviations are to hold such a share of where the plane may be, as of a normal distribution they do.
-const WITHIN: [(f64, f64); 2] = [(2.0, 0.9545), (3.0, 0.9973)];
+/// So many standard deviations are to hold such a share of where the plane may be: as of a normal distribution, but that three
+/// would hold 99.7 %; to have them do so would widen the others to twice what they should be.
+const WITHIN: [(f64, f64); 3] = [(1.0, 0.6827), (2.0, 0.9545), (3.0, 0.99)];
 
 /// A plane x = at + slope . (y, z) with its covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,8 +27,8 @@ pub struct Estimate {
 pub struct Weighed {
     /// Their mean, each with its share, and the covariance about it.
     pub estimate: Estimate,
-    /// Twice this holds 95.4 % of where the plane may meet the axis, or more, and three times this 99.7 %. The two together are
-    /// no normal distribution: its standard deviation would speak for a mitre even where that is all but excluded, and
+    /// This holds 68.3 % of where the plane may meet the axis, or more, twice this 95.4 % and three times this 99 %. The two together
+    /// are no normal distribution: its standard deviation would speak for a mitre even where that is all but excluded, and
     /// twice it alone would be silent of one that is not.
     pub sigma_mm: f64,
     /// How likely it is cut square.
