@@ -46,6 +46,8 @@ fn flat_walls_bias_neither_angle_nor_radius_and_are_given_per_bend() {
         let flattening = vec![most, 0.6 * most, 0.8 * most];
         let found = forward(&measure(&scanned(vec![0.03, 0.03, 0.03], flattening.clone(), seed)));
         assert_eq!(found.bends.len(), 3, "{most}: {:?}", found.bends);
+        let told = found.decisions.iter().find(|d| d.what.starts_with("outer walls flattened"));
+        assert!(told.is_some_and(|d| d.gain > 100.0 && d.kept), "{most}: {:?}", found.decisions);
         for ((b, truth), flat) in found.bends.iter().zip(&lra().bends).zip(flattening) {
             let off_deg = (b.angle_rad - truth.angle_rad).to_degrees();
             assert!(off_deg.abs() < 0.01, "{most}: angle {off_deg} off");

@@ -97,9 +97,8 @@ fn finish_as_chosen(
         let (radius_mm, bends) = (shown.radius_mm, best.model.lra.bends.len());
         return Err(ReconstructError::PoorFit { used: best.used, points, radius_mm, bends });
     }
-    let lone = flattened(&mut whole, &best, chosen);
-    let correlation = lone.as_ref().map_or_else(|| correlation(&whole, &best), |lone| lone.1);
-    best = lone.map_or(best, |lone| lone.0);
+    let correlation;
+    (best, correlation) = with_flattening(&mut whole, best, chosen);
     // Sigmas by what the points say together, not by their number; what is held was found so already.
     if whole.passes().len() > 1 {
         best.information = realign::information(&whole, &best);
@@ -120,6 +119,7 @@ fn finish_as_chosen(
     }
     measured.residual_median_mm = best.median_mm;
     measured.decisions.clone_from(&chosen.decisions);
+    measured.decisions.extend(flattening::decision(&best, correlation.near));
     measured.points_total = whole.file_len();
     measured.warnings.splice(0..0, warnings.iter().cloned());
     let (spine, TubeModel { lra, ovality_mm, flattening, .. }) = (best.model.spine(), best.model);
@@ -152,17 +152,21 @@ fn fit_from(whole: &mut Whole, start: &TubeModel, cutoff_mm: f64, chosen: &Struc
     polish(whole, start, effort, &chosen.held).unwrap_or_else(|| fit(whole, start, effort))
 }
 
-/// The fit with flattened outer walls, where the points ask for them, and how they correlate about it: what is left of a wall
+/// The fit, with flattened outer walls where the points ask for them, and how they correlate about it: what is left of a wall
 /// that the fit lacks would pass for correlation, so the last word is had with the walls fitted.
-fn flattened(whole: &mut Whole, fit: &Fit, chosen: &Structure) -> Option<(Fit, Correlation)> {
-    if fit.model.flattening.is_free() {
-        return None;
+fn with_flattening(whole: &mut Whole, round: Fit, chosen: &Structure) -> (Fit, Correlation) {
+    let known = round.model.flattening.is_free();
+    let told = if known { None } else { flattening::told(whole, &round.model, round.cutoff_mm) };
+    if let Some(told) = told {
+        let start = TubeModel { flattening: told.flattening.clone(), ..round.model.clone() };
+        let flattened = fit_from(whole, &start, round.cutoff_mm, chosen);
+        let correlation = correlation(whole, &flattened);
+        if told.stands_out(correlation.near) {
+            return (flattened, correlation);
+        }
     }
-    let told = flattening::told(whole, &fit.model, fit.cutoff_mm)?;
-    let start = TubeModel { flattening: told.flattening.clone(), ..fit.model.clone() };
-    let fit = fit_from(whole, &start, fit.cutoff_mm, chosen);
-    let correlation = correlation(whole, &fit);
-    told.stands_out(correlation.near).then_some((fit, correlation))
+    let correlation = correlation(whole, &round);
+    (round, correlation)
 }
 
 /// The points that show the tube's ends, see [`Whole::ends`].

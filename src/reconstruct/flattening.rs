@@ -13,6 +13,7 @@ use super::model::{Flattening, Parameter, TubeModel, Wall};
 use super::moments::Sample;
 use super::normal::equations;
 use super::structure::Structure;
+use crate::tube::Decision;
 
 /// So many standard deviations from 0 is flattened: by chance one tube of two hundred with ten bends.
 const TOLD_SIGMAS: f64 = 3.5;
@@ -125,6 +126,22 @@ pub fn freed(model: &TubeModel) -> Flattening {
     let bends_mm: Vec<f64> = (0..model.lra.bends.len()).map(|i| model.flattening_mm(i)).collect();
     let largest_mm = bends_mm.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
     Flattening::Free { bends_mm, spread_mm: if largest_mm > 0.0 { largest_mm } else { f64::INFINITY } }
+}
+
+/// What speaks for the outer walls of a fit with its last covariance, where they are free; `correlation`: points that say one
+/// thing.
+pub fn decision(fit: &Fit, correlation: f64) -> Option<Decision> {
+    let price = (fit.used as f64 / correlation).max(2.0).ln();
+    let (mut gain, mut largest_mm) = (0.0, 0.0_f64);
+    for (j, parameter) in fit.parameters.iter().enumerate() {
+        if let Parameter::Flattening(i) = parameter {
+            let flat_mm = fit.model.flattening_mm(*i);
+            largest_mm = largest_mm.max(flat_mm.abs());
+            gain += flat_mm * flat_mm / fit.covariance[(j, j)].max(1e-300) - price;
+        }
+    }
+    let what = format!("outer walls flattened by up to {largest_mm:.3} mm");
+    fit.model.flattening.is_free().then_some(Decision { what, bend: None, gain, kept: true })
 }
 
 /// The information on a fit's values with what is expected of the outer walls: unlike other expectations this one counts, since
