@@ -120,7 +120,7 @@ pub struct Column {
 }
 
 /// A bend whose arc is shorter than this, in tube radii, is not long enough to become oval: between its ramps nothing is left.
-const SHORTEST_OVAL_RADII: f64 = 0.4;
+const SHORTEST_OVAL_RADII: f64 = 0.25;
 
 /// Ovality beyond this share of the radius is no bent tube's any more.
 const MOST_OVAL: f64 = 0.15;

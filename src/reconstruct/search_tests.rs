@@ -171,8 +171,8 @@ fn all_wide_bends_are_doubled_and_no_others() {
 
 #[test]
 fn arcs_that_are_all_ramp_are_round_by_rule() {
-    // 0.4 radii of 10 mm on a CLR of 40: 0.1 rad.
-    for (angle, oval) in [(0.099, false), (0.101, true)] {
+    // A quarter of the radius of 10 mm on a CLR of 40: 0.0625 rad.
+    for (angle, oval) in [(0.062, false), (0.063, true)] {
         let mut model = tube(vec![bend(100.0, 0.0, angle)]);
         model.ovality_mm = vec![-0.2];
         let free = model.parameters().contains(&Parameter::Ovality(0));
