@@ -207,6 +207,13 @@ fn hard_scans_that_once_failed() {
     expect_right(Set::Hard, &[280, 20012, 20032, 20184, 40189, 40266]);
 }
 
+/// Ends in the shadow of another leg, whose outline was taken for an oblique cut (71086, 72206), and the ovality of a short bend
+/// taken for another bend (71141).
+#[test]
+fn tubes_that_once_were_measured_wrong() {
+    expect_right(Set::Thirty, &[71086, 71141, 72206]);
+}
+
 fn expect_right(set: Set, seeds: &[u64]) {
     let folder = TempDir::new().unwrap();
     for &seed in seeds {

@@ -57,20 +57,17 @@ pub fn told(data: &mut impl Data, model: &TubeModel, cutoff_mm: f64) -> Option<T
     let pass = data.pass(&model, cutoff_mm);
     let (normal, gradient) = equations(&pass.moments, &model, &parameters);
     let variance = pass.variance_mm2(parameters.len());
-    let (own, others): (Vec<usize>, Vec<usize>) =
-        (0..parameters.len()).partition(|j| is_flattening(&parameters[*j]));
+    let own: Vec<(usize, usize)> = own(&parameters).collect();
+    let others: Vec<usize> = (0..parameters.len()).filter(|j| own.iter().all(|(o, _)| o != j)).collect();
     let inverse = invert(&normal.select_rows(&others).select_columns(&others));
     let (mut sigmas, mut largest_mm) = (0.0_f64, 0.0_f64);
-    for j in own {
+    for (j, bend) in own {
         let follows = &inverse * normal.column(j).select_rows(&others);
         let curvature = normal[(j, j)] - follows.dot(&normal.column(j).select_rows(&others));
         let slope = gradient[j] - follows.dot(&gradient.select_rows(&others));
         let out = slope.abs() / (curvature * variance).sqrt();
         let size_mm = slope.abs() / curvature;
-        if curvature > LEAST_OWN * normal[(j, j)]
-            && out > TOLD_SIGMAS
-            && size_mm > least_mm(&model, parameters[j])
-        {
+        if curvature > LEAST_OWN * normal[(j, j)] && out > TOLD_SIGMAS && size_mm > least_mm(&model, bend) {
             sigmas = sigmas.max(out);
             largest_mm = largest_mm.max(size_mm);
         }
@@ -79,16 +76,19 @@ pub fn told(data: &mut impl Data, model: &TubeModel, cutoff_mm: f64) -> Option<T
     (sigmas > 0.0).then_some(Told { flattening, sigmas })
 }
 
-/// A wall is flattened by no less than this.
-fn least_mm(model: &TubeModel, parameter: Parameter) -> f64 {
-    let Parameter::Flattening(i) = parameter else { return 0.0 };
+/// The flattenings among a tube's values: which value, and of which bend.
+fn own(parameters: &[Parameter]) -> impl Iterator<Item = (usize, usize)> {
+    parameters.iter().enumerate().filter_map(|(j, parameter)| match parameter {
+        Parameter::Flattening(bend) => Some((j, *bend)),
+        _ => None,
+    })
+}
+
+/// The wall of bend i is flattened by no less than this.
+fn least_mm(model: &TubeModel, i: usize) -> f64 {
     let (radius_mm, bend) = (model.tube_radius_mm, &model.lra.bends[i]);
     let length_mm = (bend.angle_rad * bend.radius_mm).max(radius_mm);
     SLIGHT * radius_mm + OF_OVALITY * model.ovality_mm[i].abs() * radius_mm / length_mm
-}
-
-fn is_flattening(parameter: &Parameter) -> bool {
-    matches!(parameter, Parameter::Flattening(_))
 }
 
 /// How flat the sample shows the outer walls of a tube with this structure: each bend's own as far as it tells, the usual one
@@ -102,28 +102,25 @@ pub fn walls(sample: &[Point3<f64>], found: &Structure) -> Option<Vec<Wall>> {
     }
     let start = TubeModel { flattening: freed(model), ..model.clone() };
     let free = fit(&mut sample, &start, Effort { cutoff_mm, rounds: 0, steps: STEPS, prior: found.prior });
-    let own = |(j, parameter): (usize, &Parameter)| match parameter {
-        Parameter::Flattening(i) => Some((*i, free.covariance[(j, j)].max(1e-300))),
-        _ => None,
-    };
-    let bends: Vec<(usize, f64)> = free.parameters.iter().enumerate().filter_map(own).collect();
+    let (known_mm, found_mm, middles) =
+        (model.flattenings_mm(), free.model.flattenings_mm(), free.model.middles());
+    let bends: Vec<(usize, f64)> =
+        own(&free.parameters).map(|(j, i)| (i, free.covariance[(j, j)].max(1e-300))).collect();
     let weight: f64 = bends.iter().map(|(_, variance)| variance.recip()).sum();
-    let flat_mm = |i: usize| free.model.flattening_mm(i);
-    let usual_mm = bends.iter().map(|(i, variance)| flat_mm(*i) / variance).sum::<f64>() / weight;
+    let usual_mm = bends.iter().map(|(i, variance)| found_mm[*i] / variance).sum::<f64>() / weight;
     let spread_mm2 = (UNLIKE * usual_mm).powi(2);
-    let wall = |(i, variance): &(usize, f64)| {
+    let wall = |&(i, variance): &(usize, f64)| {
         let trust = spread_mm2 / (spread_mm2 + variance);
-        Wall { at: free.model.middle(*i), flat_mm: usual_mm + trust * (flat_mm(*i) - usual_mm) }
+        Wall { at: middles[i], flat_mm: usual_mm + trust * (found_mm[i] - usual_mm) }
     };
     let walls: Vec<Wall> = bends.iter().map(wall).collect();
-    let news =
-        |(wall, (i, _)): (&Wall, &(usize, f64))| (wall.flat_mm - model.flattening_mm(*i)).abs() > noise_mm;
-    walls.iter().zip(&bends).any(news).then_some(walls)
+    let is_news = |(wall, (i, _)): (&Wall, &(usize, f64))| (wall.flat_mm - known_mm[*i]).abs() > noise_mm;
+    walls.iter().zip(&bends).any(is_news).then_some(walls)
 }
 
 /// The model's flattening as each bend's own, expected to be about as large as it is.
 pub fn freed(model: &TubeModel) -> Flattening {
-    let bends_mm: Vec<f64> = (0..model.lra.bends.len()).map(|i| model.flattening_mm(i)).collect();
+    let bends_mm = model.flattenings_mm();
     let largest_mm = bends_mm.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
     Flattening::Free { bends_mm, spread_mm: if largest_mm > 0.0 { largest_mm } else { f64::INFINITY } }
 }
@@ -131,15 +128,10 @@ pub fn freed(model: &TubeModel) -> Flattening {
 /// What speaks for the outer walls of a fit with its last covariance, where they are free; `correlation`: points that say one
 /// thing.
 pub fn decision(fit: &Fit, correlation: f64) -> Option<Decision> {
-    let price = (fit.used as f64 / correlation).max(2.0).ln();
-    let (mut gain, mut largest_mm) = (0.0, 0.0_f64);
-    for (j, parameter) in fit.parameters.iter().enumerate() {
-        if let Parameter::Flattening(i) = parameter {
-            let flat_mm = fit.model.flattening_mm(*i);
-            largest_mm = largest_mm.max(flat_mm.abs());
-            gain += flat_mm * flat_mm / fit.covariance[(j, j)].max(1e-300) - price;
-        }
-    }
+    let (price, bends_mm) = ((fit.used as f64 / correlation).max(2.0).ln(), fit.model.flattenings_mm());
+    let worth = |(j, i): (usize, usize)| bends_mm[i].powi(2) / fit.covariance[(j, j)].max(1e-300) - price;
+    let gain = own(&fit.parameters).map(worth).sum();
+    let largest_mm = bends_mm.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
     let what = format!("outer walls flattened by up to {largest_mm:.3} mm");
     fit.model.flattening.is_free().then_some(Decision { what, bend: None, gain, kept: true })
 }
@@ -148,9 +140,7 @@ pub fn decision(fit: &Fit, correlation: f64) -> Option<Decision> {
 /// walls that points tell badly are known to be about as flat as the others.
 pub fn expected(mut information: DMatrix<f64>, fit: &Fit) -> DMatrix<f64> {
     if let Flattening::Free { spread_mm, .. } = fit.model.flattening {
-        for (j, _) in fit.parameters.iter().enumerate().filter(|(_, p)| is_flattening(p)) {
-            information[(j, j)] += spread_mm.powi(-2);
-        }
+        own(&fit.parameters).for_each(|(j, _)| information[(j, j)] += spread_mm.powi(-2));
     }
     information
 }

@@ -53,12 +53,12 @@ pub struct Arc {
 
 /// The segments of the model, line, arc, ..., line.
 pub fn prepare(model: &TubeModel) -> Vec<Local> {
-    let spine = model.spine();
+    let (spine, flattenings_mm) = (model.spine(), model.flattenings_mm());
     let local = |(k, s): (usize, &crate::tube::Segment)| {
         let (mut facing, mut oval) = (Sector::new(0.0, 0.0), Sector::new(0.0, 0.0));
         let arc = match s.kind {
             SegmentKind::Arc { radius_mm, angle_rad } => {
-                let (ovality_mm, flattening_mm) = (model.ovality_mm[k / 2], model.flattening_mm(k / 2));
+                let (ovality_mm, flattening_mm) = (model.ovality_mm[k / 2], flattenings_mm[k / 2]);
                 let arc = Arc { radius_mm, angle_rad, ovality_mm, flattening_mm };
                 let full = arc.full_ramp_mm(model.tube_radius_mm) / radius_mm;
                 facing = Sector::new(0.0, angle_rad);
@@ -180,6 +180,13 @@ impl Local {
             return 1.0;
         }
         arc.ramp(x.atan2(y).rem_euclid(std::f64::consts::TAU), tube_radius_mm)
+    }
+
+    /// How oval the section is at a distance along the segment, and how flat its outer wall.
+    pub fn uneven_mm(&self, along_mm: f64, tube_radius_mm: f64) -> (f64, f64) {
+        let Some(arc) = &self.arc else { return (0.0, 0.0) };
+        let ramp = arc.ramp(along_mm / arc.radius_mm, tube_radius_mm);
+        (arc.ovality_mm * ramp, arc.flattening_mm * ramp)
     }
 
     /// Signed distance of a point from the tube's surface, outside positive.

@@ -275,7 +275,7 @@ pub(super) fn values(model: &TubeModel, ends: &Ends) -> Values {
         angles: model.lra.bends.iter().map(|b| b.angle_rad).collect(),
         radii: model.lra.bends.iter().map(|b| b.radius_mm).collect(),
         ovalities: model.ovality_mm.iter().map(|e| -2.0 * e / model.tube_radius_mm).collect(),
-        flattenings: (0..n).map(|i| -0.5 * model.flattening_mm(i) / model.tube_radius_mm).collect(),
+        flattenings: model.flattenings_mm().iter().map(|g| -0.5 * g / model.tube_radius_mm).collect(),
         tube_radius: vec![model.tube_radius_mm],
         lengths,
     }

@@ -195,26 +195,26 @@ impl TubeModel {
         Spine::from_lra(&self.lra, self.start)
     }
 
-    /// How flat the outer wall of bend i is: its value of [`Flattening`].
-    pub fn flattening_mm(&self, i: usize) -> f64 {
-        match &self.flattening {
-            Flattening::Free { bends_mm, .. } => bends_mm[i],
-            Flattening::Known(walls) if !walls.is_empty() && self.may_be_oval(i) => {
-                let middle = self.middle(i);
-                let nearest = walls
-                    .iter()
-                    .min_by(|a, b| (a.at - middle).norm_squared().total_cmp(&(b.at - middle).norm_squared()));
-                nearest.map_or(0.0, |wall| wall.flat_mm)
-            }
-            Flattening::Known(_) => 0.0,
-        }
+    /// How flat the outer walls of all bends are: their values of [`Flattening`].
+    pub fn flattenings_mm(&self) -> Vec<f64> {
+        let walls = match &self.flattening {
+            Flattening::Free { bends_mm, .. } => return bends_mm.clone(),
+            Flattening::Known(walls) if walls.is_empty() => return vec![0.0; self.lra.bends.len()],
+            Flattening::Known(walls) => walls,
+        };
+        let nearest = |(i, middle): (usize, &Point3<f64>)| {
+            let away = |wall: &Wall| (wall.at - middle).norm_squared();
+            let nearest = walls.iter().min_by(|a, b| away(a).total_cmp(&away(b)));
+            nearest.filter(|_| self.may_be_oval(i)).map_or(0.0, |wall| wall.flat_mm)
+        };
+        self.middles().iter().enumerate().map(nearest).collect()
     }
 
-    /// The middle of bend i.
-    pub fn middle(&self, i: usize) -> Point3<f64> {
+    /// The middles of all bends.
+    pub fn middles(&self) -> Vec<Point3<f64>> {
         let spine = self.spine();
-        let arc = &spine.segments()[2 * i + 1];
-        arc.frame_at(0.5 * arc.length_mm).translation.vector.into()
+        let arcs = spine.segments().iter().skip(1).step_by(2);
+        arcs.map(|arc| arc.frame_at(0.5 * arc.length_mm).translation.vector.into()).collect()
     }
 
     /// How the parameters move the tube. The segments are the spine's: line, arc, ..., line.

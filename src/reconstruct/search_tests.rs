@@ -5,7 +5,8 @@ use proptest::prelude::*;
 
 use super::evidence::Solved;
 use super::fit::{Data, RadiusPrior, Way, descend};
-use super::model::{Parameter, TubeModel};
+use super::flattening::freed;
+use super::model::{Flattening, Parameter, TubeModel, Wall};
 use super::moves::{doubled, drawn_apart, is_one, merged, shallow_pairs, with_wide_doubled, without_bend};
 use super::normal;
 use super::reach::reaching;
@@ -179,6 +180,22 @@ fn arcs_that_are_all_ramp_are_round_by_rule() {
         assert_eq!((free, model.may_be_oval(0)), (oval, oval));
         assert_eq!(model.settled().ovality_mm[0] != 0.0, oval);
     }
+}
+
+#[test]
+fn a_bend_has_the_flattening_of_the_wall_seen_nearest_to_it() {
+    let mut model = three_bends();
+    assert_eq!(model.flattenings_mm(), [0.0; 3]);
+    let [first, _, last] = model.middles()[..] else { panic!("three bends") };
+    let wall = |at, flat_mm| Wall { at, flat_mm };
+    model.flattening = Flattening::Known(vec![wall(last, -0.1), wall(first, -0.3)]);
+    // The last bend is too short to have any.
+    model.lra.bends[2].angle_rad = 0.05;
+    assert_eq!(model.flattenings_mm(), [-0.3, -0.1, 0.0]);
+    // Taken for each bend's own they stay.
+    model.flattening = freed(&model);
+    assert_eq!(model.flattenings_mm(), [-0.3, -0.1, 0.0]);
+    assert!(model.parameters().contains(&Parameter::Flattening(1)));
 }
 
 #[test]

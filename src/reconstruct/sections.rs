@@ -10,7 +10,7 @@ use nalgebra::{Cholesky, Matrix2, Matrix5, Point3, SMatrix, Vector2, Vector3, Ve
 use rayon::prelude::*;
 
 use super::fit::Data;
-use super::local::{Arc, Local, Outline, prepare, settle};
+use super::local::{Local, Outline, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
 use super::section::{
@@ -19,7 +19,7 @@ use super::section::{
 };
 use super::strangers::{Crowded, Strangers, beset, is_at_an_end, is_oval_untold};
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
-use crate::tube::{Bend, Spine, any_normal};
+use crate::tube::{Spine, any_normal};
 
 /// The same about a base that has been fitted, radius and ovality and all.
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
@@ -126,7 +126,8 @@ impl CentreLine {
         let spreads = if fitted { FITTED_SPREADS } else { SPREADS }.map(|s| s * base.tube_radius_mm);
         let spine = base.spine();
         let bins = Bins::new(&spine, base.tube_radius_mm, points.len());
-        let seen = see(points, base, &bins);
+        let locals = prepare(base);
+        let seen = see(points, base, &locals, &bins);
         let mut grouped = group(seen, bins.total);
         // Near an end burr, bore and face lean, not the tube.
         let inside: Vec<bool> = bins.places_mm().map(|at| !may_be_damaged(base, &spine, at)).collect();
@@ -177,7 +178,7 @@ impl CentreLine {
                 continue;
             }
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
-            let oval_mm = [uneven(base, place, along).0, 0.0];
+            let oval_mm = [locals[place].uneven_mm(along, base.tube_radius_mm).0, 0.0];
             doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, at_mm));
             let best = solve(&sums, &SPREADS.map(|s| s * base.tube_radius_mm), noise);
             let least = cost(&sums, &best).max(0.0);
@@ -468,35 +469,19 @@ fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
     median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
 }
 
-/// How oval the base tube is at a place of a segment, and how flat its outer wall.
-fn uneven(base: &TubeModel, segment: usize, along_mm: f64) -> (f64, f64) {
-    match base.lra.bends.get(segment / 2).filter(|_| segment % 2 == 1) {
-        Some(bend) => {
-            let ovality_mm = base.ovality_mm[segment / 2];
-            let Bend { radius_mm, angle_rad, .. } = *bend;
-            let flattening_mm = base.flattening_mm(segment / 2);
-            let arc = Arc { radius_mm, angle_rad, ovality_mm, flattening_mm };
-            let ramp = arc.ramp(along_mm / radius_mm, base.tube_radius_mm);
-            (ovality_mm * ramp, flattening_mm * ramp)
-        }
-        None => (0.0, 0.0),
-    }
-}
-
 /// All points near the base tube.
-fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
-    let locals = prepare(base);
+fn see(points: &[Point3<f64>], base: &TubeModel, locals: &[Local], bins: &Bins) -> Vec<Seen> {
     let spine = base.spine();
     let cutoff = FIRST_CUTOFF * base.tube_radius_mm;
     let part = |points: &[Point3<f64>]| {
         let mut segment = 0;
         let one = |p: &Point3<f64>| {
-            let mut local = settle(p, &mut segment, &locals);
+            let mut local = settle(p, &mut segment, locals);
             let mut off = locals[segment as usize].off_axis(&local);
             if (off.norm() - base.tube_radius_mm).abs() > cutoff {
                 // The point before may have been on another leg.
                 segment = spine.closest(p).segment as u32;
-                local = settle(p, &mut segment, &locals);
+                local = settle(p, &mut segment, locals);
                 off = locals[segment as usize].off_axis(&local);
             }
             let distance = off.norm();
@@ -506,7 +491,7 @@ fn see(points: &[Point3<f64>], base: &TubeModel, bins: &Bins) -> Vec<Seen> {
             let k = segment as usize;
             let along_mm = locals[k].unclamped_along_mm(&local);
             let (cos, sin) = (off.x / distance, off.y / distance);
-            let (oval_mm, flat_mm) = uneven(base, k, along_mm);
+            let (oval_mm, flat_mm) = locals[k].uneven_mm(along_mm, base.tube_radius_mm);
             // From the outside of the bend, which is the other way.
             let outline = Outline::at(-cos, sin, base.tube_radius_mm, oval_mm, flat_mm);
             let residual_mm = distance - outline.radius_mm;

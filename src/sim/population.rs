@@ -18,9 +18,6 @@ use crate::tube::{Bend, Frame, Lra, Spine};
 
 pub use hard::{Scene, random_scene};
 
-/// Outer walls are flattened by no more than this share of the diameter.
-const MOST_FLATTENED: f64 = 0.01;
-
 /// One member of the population: the tube and how it is scanned.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Specimen {
@@ -66,7 +63,7 @@ pub fn flattened_tube(seed: u64) -> Specimen {
     rng.set_stream(2);
     let mut drawn =
         |most: f64| specimen.shape.lra.bends.iter().map(|_| rng.random_range(0.0..most)).collect();
-    let (ovality, flattening) = (drawn(0.06), drawn(MOST_FLATTENED));
+    let (ovality, flattening) = (drawn(0.06), drawn(0.01));
     Specimen { shape: TubeShape { ovality, flattening, ..specimen.shape.clone() }, ..specimen }
 }
 

@@ -3,8 +3,8 @@
 //! The surface is where the distance to the centre line equals the section's radius. A ray advances by that
 //! distance (it cannot pass the surface) until it is close, then Newton's method finds the root. In a bend the
 //! section is an ellipse flattened in the bend's plane, its outer wall flatter still, growing out of the circle within a
-//! radius of arc. Both ends are
-//! clipped (`end`); with a wall the tube is hollow, and light returns from the faces and from the bore close to them.
+//! radius of arc. Both ends are clipped (`end`); with a wall the tube is hollow, and light returns from the faces and from the
+//! bore close to them.
 
 use std::f64::consts::PI;
 
