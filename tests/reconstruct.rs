@@ -214,6 +214,19 @@ fn tubes_that_once_were_measured_wrong() {
     expect_right(Set::Thirty, &[71086, 71141, 72206]);
 }
 
+/// A jaw's few points that turned the centre line back at its end (74217) or made it run about (76210), flat walls believed before the
+/// passes were moved (74185), and a last stretch that was not looked for behind a hidden one (76107).
+#[test]
+fn hard_scans_that_failed_last() {
+    expect_right(Set::Hard, &[74185, 74217, 76107, 76210]);
+}
+
+/// A tube that lost its way from its polygon, and took its own points for strangers' there.
+#[test]
+fn a_tube_that_once_lost_its_way() {
+    expect_right(Set::Thirty, &[76213]);
+}
+
 fn expect_right(set: Set, seeds: &[u64]) {
     let folder = TempDir::new().unwrap();
     for &seed in seeds {

@@ -8,6 +8,7 @@ use std::collections::BinaryHeap;
 
 use nalgebra::{Point3, Vector3};
 
+use super::follow::TIGHTEST_RADII;
 use super::mls::SpinePoint;
 use crate::cloud::{Neighbours, PointCloud};
 
@@ -16,6 +17,13 @@ const GAP_RADII: f64 = 10.0;
 
 /// Edges of the crust itself are no longer than this many spacings.
 const REACH_SPACINGS: f64 = 4.0;
+
+/// The way that a chain goes is told over this many tube radii, to about such an angle; lines that meet at less are parallel; and
+/// where they meet is told to so many tube radii.
+const DIRECTION_RADII: f64 = 2.0;
+const ASTRAY: f64 = 0.15;
+const PARALLEL: f64 = 0.2;
+const SLACK_RADII: f64 = 0.5;
 
 /// Neighbours that may be the nearest and the half neighbour.
 const LOOKED_AT: usize = 24;
@@ -39,23 +47,63 @@ pub fn is_closed(chain: &[Point3<f64>], spacing_mm: f64, radius_mm: f64) -> bool
     (last - first).norm() < REACH_SPACINGS * spacing_mm && length_mm(chain) > 6.0 * radius_mm
 }
 
-/// A chain without scraps at its ends: what is shorter than the gap before it, and than a tube radius, is no
-/// continuation that anyone could vouch for.
-pub fn trimmed(chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
-    let reach = REACH_SPACINGS * spacing_mm;
-    let mut parts: Vec<&[Point3<f64>]> = chain.chunk_by(|a, b| (b - a).norm() < reach).collect();
-    let scrap = |end: &[Point3<f64>], gap: f64| length_mm(end) < gap.min(radius_mm);
-    while let [.., before, last] = parts[..]
-        && scrap(last, (last[0] - before[before.len() - 1]).norm())
-    {
-        parts.pop();
+/// A chain without scraps at its ends: what is shorter than the gap before it, and than a tube radius or where no single bend
+/// leads across the gap, is no continuation that anyone could vouch for.
+pub fn trimmed(mut chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
+    for _ in 0..2 {
+        chain.reverse();
+        while let Some(sound) = sound(&chain, spacing_mm, radius_mm) {
+            chain.truncate(sound);
+        }
     }
-    while let [first, after, ..] = parts[..]
-        && scrap(first, (after[0] - first[first.len() - 1]).norm())
-    {
-        parts.remove(0);
+    chain
+}
+
+/// How many of a chain's points there are before a gap that only a scrap lies behind; the first such gap.
+fn sound(chain: &[Point3<f64>], spacing_mm: f64, radius_mm: f64) -> Option<usize> {
+    let scrap = |i: &usize| {
+        let (before, behind) = chain.split_at(*i);
+        let gap_mm = (behind[0] - before[i - 1]).norm();
+        let length_mm = solid_length_mm(behind, spacing_mm);
+        gap_mm >= REACH_SPACINGS * spacing_mm
+            && length_mm < gap_mm
+            && (length_mm < radius_mm || !is_across_one_bend(before, behind, radius_mm))
+    };
+    (1..chain.len()).find(scrap)
+}
+
+/// Whether a straight or one bend leads from the end of one piece to the begin of another.
+fn is_across_one_bend(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> bool {
+    let (from, to) = (before[before.len() - 1], behind[0]);
+    let heading = |from: Point3<f64>, mut way: std::slice::Iter<Point3<f64>>| {
+        let far = |p: &&Point3<f64>| (*p - from).norm() > DIRECTION_RADII * radius_mm;
+        let last = way.as_slice().last().copied();
+        let to = way.find(far).copied().or(last)?;
+        (to - from).try_normalize(1e-12)
+    };
+    let backwards: Vec<Point3<f64>> = before.iter().rev().copied().collect();
+    let (Some(back), Some(on)) = (heading(from, backwards.iter()), heading(to, behind.iter())) else {
+        return true;
+    };
+    let (out, gap) = (-back, to - from);
+    let cos = out.dot(&on);
+    let tangent_mm = TIGHTEST_RADII * radius_mm * ((1.0 - cos) / (1.0 + cos).max(1e-3)).sqrt();
+    // The two lines are nearest to each other where the bend's corner is.
+    let square = 1.0 - cos * cos;
+    let slack_mm = SLACK_RADII * radius_mm + ASTRAY * gap.norm();
+    if square < PARALLEL * PARALLEL {
+        let aside_mm = gap.cross(&out).norm();
+        return if cos > 0.0 {
+            aside_mm < slack_mm
+        } else {
+            aside_mm > 2.0 * TIGHTEST_RADII * radius_mm - slack_mm
+        };
     }
-    parts.concat()
+    let (along_out, along_on) = (gap.dot(&out), gap.dot(&on));
+    let before_mm = (along_out - cos * along_on) / square;
+    let behind_mm = (along_on - cos * along_out) / square;
+    let skew_mm = (gap - out * before_mm - on * behind_mm).norm();
+    skew_mm < slack_mm && before_mm.min(behind_mm) > tangent_mm - slack_mm
 }
 
 /// Joins points spaced by about `spacing_mm` on tubes of radius `radius_mm` to polygons, the longest first.
@@ -301,5 +349,37 @@ mod tests {
             .map(|s| SpinePoint { point: Point3::new(s.point.x, s.point.y, 0.0), ..s })
             .collect();
         assert!(is_closed(&connect(&flat, 3.2, 10.0)[0], 3.2, 10.0));
+    }
+
+    /// A straight along x that ends at 0, every 3 mm, and what lies behind a gap there.
+    fn with_end(end: impl Iterator<Item = Point3<f64>>) -> Vec<Point3<f64>> {
+        (-60..=0).map(|i| Point3::new(3.0 * f64::from(i), 0.0, 0.0)).chain(end).collect()
+    }
+
+    #[test]
+    fn an_end_to_where_no_bend_leads_is_a_scrap() {
+        // 18 mm behind gaps of 30 mm and more, of a tube of radius 10.
+        let piece = |from: [f64; 3], to: [f64; 3]| {
+            let (from, way) = (Point3::from(from), Vector3::from(to));
+            with_end((0..=6).map(move |i| from + way * (3.0 * f64::from(i))))
+        };
+        let sound = [
+            ("straight on", piece([30.0, 0.5, 0.0], [1.0, 0.0, 0.0])),
+            ("around a corner", piece([25.0, 25.0, 0.0], [0.0, 1.0, 0.0])),
+            ("around and back", piece([0.0, 40.0, 0.0], [-1.0, 0.0, 0.0])),
+        ];
+        let scraps = [
+            ("back beside itself", piece([-24.0, 20.0, 0.0], [-1.0, 0.0, 0.0])),
+            ("past another plane", piece([25.0, 20.0, 0.0], [0.0, 0.0, 1.0])),
+            ("a sharp corner", piece([25.0, 20.0, 0.0], [-0.9, 0.436, 0.0])),
+        ];
+        for (what, chain) in sound {
+            assert_eq!(trimmed(chain.clone(), 3.0, 10.0), chain, "{what}");
+        }
+        for (what, mut chain) in scraps {
+            assert_eq!(trimmed(chain.clone(), 3.0, 10.0).len(), 61, "{what}");
+            chain.reverse();
+            assert_eq!(trimmed(chain, 3.0, 10.0).len(), 61, "{what}, at the beginning");
+        }
     }
 }

@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use super::error::ReconstructError;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
 use super::flattening::{self, freed};
-use super::measure;
+use super::measure::{self, EndPoints};
 use super::model::Flattening;
 use super::moments::Sample;
 use super::moves::without_bend;
@@ -18,15 +18,18 @@ use super::realign;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
 use super::undecided::{Undecided, widened};
-use super::whole::Whole;
+use super::whole::{Whole, end_frames};
 use super::{Reconstruction, TubeModel};
-use crate::tube::MeasuredTube;
+use crate::tube::{Frame, MeasuredTube};
 
 /// An angle is never left open: a tube with one less certain than this was not measured.
 const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 
 /// Share of the points that must lie on the tube.
 const LEAST_USED_SHARE: f64 = 0.5;
+
+/// Where a centre line ends the tube does, within so many tube radii.
+const HIDDEN_RADII: f64 = 4.0;
 
 /// Of larger clouds only so much of the end straights is looked at for the ends, in tube radii: a little more than the
 /// ends ask for at most, less where that holds more points than tell the scan's pattern.
@@ -106,7 +109,7 @@ fn finish_as_chosen(
     let information = flattening::expected(&best.information / correlation.near, &best);
     let held = profile::tightened(&information, &best.parameters, &chosen.held);
     best.covariance = widened(held, &best.parameters, &chosen.undecided);
-    let ends = end_points(&whole, shown.sample, &best);
+    let ends = end_points(&whole, shown, &best);
     let moved_mm = realign::moved_mm(whole.passes(), &best.model);
     let radius_doubt = (correlation.along_arc / correlation.near).sqrt();
     let mut measured = measure::measure(&mut best, ends, radius_doubt, moved_mm);
@@ -169,8 +172,16 @@ fn with_flattening(whole: &mut Whole, round: Fit, chosen: &Structure) -> (Fit, C
     (round, correlation)
 }
 
-/// The points that show the tube's ends, see [`Whole::ends`].
-fn end_points(whole: &Whole, sample: &[Point3<f64>], fit: &Fit) -> [Vec<Point3<f64>>; 2] {
+/// What shows the tube's ends.
+fn end_points(whole: &Whole, shown: &Shown, fit: &Fit) -> EndPoints {
+    let reach_mm = HIDDEN_RADII * fit.model.tube_radius_mm;
+    let is_hidden = |end: Frame| shown.hidden.iter().any(|p| (end.inverse() * p).coords.norm() < reach_mm);
+    let hidden = end_frames(&fit.model.spine()).map(is_hidden);
+    EndPoints { points: points_at_ends(whole, shown.sample, fit), hidden }
+}
+
+/// See [`Whole::ends`].
+fn points_at_ends(whole: &Whole, sample: &[Point3<f64>], fit: &Fit) -> [Vec<Point3<f64>>; 2] {
     if whole.len() <= MANY_POINTS {
         return whole.ends(&fit.model, fit.cutoff_mm, f64::INFINITY, f64::INFINITY);
     }

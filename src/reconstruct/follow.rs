@@ -13,7 +13,7 @@ use crate::recognize::median;
 const REACH_RADII: f64 = 1.2;
 
 /// The tightest bend, in tube radii: nothing bends around less.
-const TIGHTEST_RADII: f64 = 1.5;
+pub(super) const TIGHTEST_RADII: f64 = 1.5;
 
 /// Errors of a spine point across the tube, in tube radii, and of its direction.
 const ASIDE_RADII: f64 = 0.06;

@@ -43,14 +43,17 @@ pub(super) struct Values {
     pub tube_radius: Vec<f64>,
 }
 
-/// Sets the end straights' lengths from the points of both [ends](super::whole::Whole::ends) and puts sigmas beside all
+/// What was scanned at the ends.
+pub struct EndPoints {
+    /// The points of both [ends](super::whole::Whole::ends).
+    pub points: [Vec<Point3<f64>>; 2],
+    /// Whether more may be behind a stretch that was not scanned.
+    pub hidden: [bool; 2],
+}
+
+/// Sets the end straights' lengths from the points at both ends and puts sigmas beside all
 /// values; the radii's are `radius_doubt` times what the covariance says. The scan's passes were moved by about `moved_mm`.
-pub fn measure(
-    fit: &mut Fit,
-    end_points: [Vec<Point3<f64>>; 2],
-    radius_doubt: f64,
-    moved_mm: f64,
-) -> MeasuredTube {
+pub fn measure(fit: &mut Fit, end_points: EndPoints, radius_doubt: f64, moved_mm: f64) -> MeasuredTube {
     let Scanned { ends, first, last } = set_ends(fit, end_points, moved_mm);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
@@ -225,15 +228,17 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, [first_points, last_points]: [Vec<Point3<f64>>; 2], moved_mm: f64) -> Scanned {
+fn set_ends(fit: &mut Fit, EndPoints { points, hidden }: EndPoints, moved_mm: f64) -> Scanned {
+    let [first_points, last_points] = points;
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
     let [first_frame, last_frame] = end_frames(&fit.model.spine());
     // Along the tube passes are known to lie on each other no better than they did across it before.
     let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise).max(moved_mm);
-    let (first, last) = rayon::join(
-        || ends::find(first_points, radius, noise, passes_mm),
-        || ends::find(last_points, radius, noise, passes_mm),
-    );
+    let find = |points, hidden| match ends::find(points, radius, noise, passes_mm) {
+        Some(End::Found(e)) if hidden && e.by_outline => Some(End::Ragged { at_mm: e.at_mm }),
+        found => found,
+    };
+    let (first, last) = rayon::join(|| find(first_points, hidden[0]), || find(last_points, hidden[1]));
     let model = &mut fit.model;
     if let Some(end) = last {
         model.lra.last_length_mm -= end.at_mm();

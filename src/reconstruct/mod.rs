@@ -190,7 +190,8 @@ fn by(
     let again =
         (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
     if let Some(again) = &again {
-        shown = Shown { whole: shown.whole.moved(&passes), sample: again, ..shown };
+        let flattening = Flattening::NONE;
+        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, ..shown };
         (chosen, notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
         let what = format!("{} passes of the scan moved onto each other", passes.len());
         chosen.decisions.push(Decision { what, bend: None, gain, kept: true });

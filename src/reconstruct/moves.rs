@@ -3,6 +3,8 @@
 //!
 //! Under `structure`, which fits every changed tube and keeps what the data supports.
 
+use std::ops::RangeInclusive;
+
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
 use super::evidence::Joint;
@@ -30,6 +32,12 @@ const SAME_RADIUS: f64 = 0.02;
 
 /// A bend this much wider than the mean may be two.
 const WIDE: f64 = 1.3;
+
+/// So many bends in a row that lead back onto the line before them are none, if the points agree: turned by less than this, and
+/// aside by less than so many tube radii.
+const DETOUR_BENDS: RangeInclusive<usize> = 3..=5;
+const DETOUR_RAD: f64 = 0.05;
+const DETOUR_RADII: f64 = 0.2;
 
 /// Smallest first angle of a bend that is tried.
 const TRIAL_RAD: f64 = 0.01;
@@ -65,6 +73,44 @@ pub fn without_bend(model: &TubeModel, i: usize) -> TubeModel {
     }
     turn_into_pose(&mut out);
     with_longer_part_in_place(model, i + 1, out, i)
+}
+
+/// The tube with a row of bends pulled straight that lead back onto the line before them, for every such row: no part is bent
+/// so, but a centre line runs so past a few points of a jaw that hides the tube. With the bends that go.
+pub fn without_detours(model: &TubeModel) -> Vec<(RangeInclusive<usize>, TubeModel)> {
+    let n = model.lra.bends.len();
+    let rows = DETOUR_BENDS.flat_map(|many| (0..(n + 1).saturating_sub(many)).map(move |i| i..=i + many - 1));
+    rows.filter_map(|row| Some((row.clone(), without_detour(model, row)?))).collect()
+}
+
+fn without_detour(model: &TubeModel, row: RangeInclusive<usize>) -> Option<TubeModel> {
+    let (first, last) = (*row.start(), *row.end());
+    let spine = model.spine();
+    let (one, other) = (&spine.segments()[2 * first + 1], &spine.segments()[2 * last + 1]);
+    let way = one.start.inverse() * other.frame_at(other.length_mm);
+    let along = way.rotation * Vector3::x();
+    let shift = way.translation.vector;
+    let aside_mm = shift.y.hypot(shift.z);
+    if along.y.hypot(along.z) > DETOUR_RAD || along.x < 0.0 || aside_mm > DETOUR_RADII * model.tube_radius_mm
+    {
+        return None;
+    }
+    let across = way.rotation * Vector3::y();
+    let roll_rad = across.z.atan2(across.y);
+    let mut out = model.clone();
+    out.lra.bends.drain(row.clone());
+    out.ovality_mm.drain(row);
+    let (length_mm, rotation_rad) =
+        (model.lra.bends[first].length_mm + shift.x, model.lra.bends[first].rotation_rad);
+    match out.lra.bends.get_mut(first) {
+        Some(next) => {
+            next.length_mm += length_mm;
+            next.rotation_rad += rotation_rad + roll_rad;
+        }
+        None => out.lra.last_length_mm += length_mm,
+    }
+    turn_into_pose(&mut out);
+    Some(with_longer_part_in_place(model, last + 1, out, first))
 }
 
 /// A changed tube whose bend `new` is the `old` one of the tube before and the first behind the change: what lies behind stays

@@ -18,6 +18,9 @@ const STRETCH_RADII: f64 = 0.5;
 const LEAST_DENSITY: f64 = 0.3;
 const EMPTY_DENSITY: f64 = 0.1;
 
+/// So many stretches in a row may be hidden at a tube's end.
+const HIDDEN_STRETCHES: usize = 4;
+
 /// The end of a centre line in tube radii that tells its direction, how straight it must be, and how far it is drawn on.
 const END_RADII: f64 = 3.0;
 const STRAIGHT_SHARE: f64 = 0.03;
@@ -27,23 +30,29 @@ const MOST_RADII: f64 = 12.0;
 const WITHIN_RADII: f64 = 0.5;
 
 /// A centre line with vertices about `spacing_mm` apart, drawn on past its ends as far as the points go on. They are to be
-/// without planar faces: a table that the tube lies on goes on as well.
+/// without planar faces: a table that the tube lies on goes on as well. And those of its ends beyond which points go on behind
+/// a stretch without: they may be the tube's, or something else's that was made to fit it.
 pub fn drawn_on(
     mut polygon: Vec<Point3<f64>>,
     spacing_mm: f64,
     radius_mm: f64,
     points: &PointCloud,
-) -> Vec<Point3<f64>> {
+) -> (Vec<Point3<f64>>, Vec<Point3<f64>>) {
+    let mut hidden = Vec::new();
     for _ in 0..2 {
         polygon.reverse();
         if let Some(end) = straight_end(&polygon, radius_mm) {
             let counts = Counts::new(points.iter(), &end, radius_mm, END_RADII * radius_mm);
-            let more_mm = counts.beyond_mm().min(MOST_RADII * radius_mm) - WITHIN_RADII * radius_mm;
+            let beyond_mm = counts.beyond_mm(0);
+            if counts.beyond_mm(HIDDEN_STRETCHES) > beyond_mm {
+                hidden.push(end * Point3::new(beyond_mm, 0.0, 0.0));
+            }
+            let more_mm = beyond_mm.min(MOST_RADII * radius_mm) - WITHIN_RADII * radius_mm;
             let vertices = (more_mm / spacing_mm).max(0.0) as usize;
             polygon.extend((1..=vertices).map(|k| end * Point3::new(k as f64 * spacing_mm, 0.0, 0.0)));
         }
     }
-    polygon
+    (polygon, hidden)
 }
 
 /// The frame at a polygon's last vertex, its x axis outwards along the last few; None when they are not in line.
@@ -77,7 +86,7 @@ pub fn reaching(model: &TubeModel, points: &[Point3<f64>]) -> TubeModel {
     let change_mm = |end: &Frame, length_mm: f64| {
         let counts = Counts::new(points.iter().copied(), end, radius, length_mm);
         let short_mm = counts.empty_mm(usual).min(length_mm);
-        if short_mm > 0.0 { -short_mm } else { counts.beyond_mm() }
+        if short_mm > 0.0 { -short_mm } else { counts.beyond_mm(0) }
     };
     let mut out = model.clone();
     out.lra.last_length_mm += change_mm(&spine.frame_at(spine.length_mm()), model.lra.last_length_mm);
@@ -152,11 +161,18 @@ impl Counts {
         Counts { stretch_mm, inside, counts }
     }
 
-    /// How far the points go on beyond the end.
-    fn beyond_mm(&self) -> f64 {
+    /// How far the points go on beyond the end, over at most so many stretches in a row without.
+    fn beyond_mm(&self, hidden: usize) -> f64 {
         let last = self.counts[self.inside - 1] as f64;
-        let goes_on = |c: &&usize| **c as f64 > LEAST_DENSITY * last;
-        self.counts[self.inside..].iter().take_while(goes_on).count() as f64 * self.stretch_mm
+        let mut reached = 0;
+        for (i, count) in self.counts[self.inside..].iter().enumerate() {
+            if *count as f64 > LEAST_DENSITY * last {
+                reached = i + 1;
+            } else if i + 1 - reached > hidden {
+                break;
+            }
+        }
+        reached as f64 * self.stretch_mm
     }
 
     /// How far the end is beyond the last stretch that is not empty.
@@ -230,7 +246,8 @@ mod tests {
         // The straight's points from -60 to 100; the polygon goes from 0 to 57.
         let mut seen = points(&tube(500.0, 80.0), 240.0, 400.0);
         seen.iter_mut().for_each(|p| p.x += 200.0);
-        let on = drawn_on(straight, 3.0, RADIUS, &PointCloud::from_points(&seen));
+        let (on, hidden) = drawn_on(straight, 3.0, RADIUS, &PointCloud::from_points(&seen));
+        assert!(hidden.is_empty());
         let (low, high) = on.iter().fold((0.0_f64, 0.0_f64), |(a, b), p| (a.min(p.x), b.max(p.x)));
         assert!((-60.0..-45.0).contains(&low), "{low}");
         assert!((85.0..100.0).contains(&high), "{high}");

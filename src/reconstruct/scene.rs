@@ -25,6 +25,8 @@ pub struct Scene {
     pub radius_mm: f64,
     /// Vertices along the centre line, about 0.3 tube radii apart except across gaps.
     pub polygon: Vec<Point3<f64>>,
+    /// Ends of it beyond which points go on behind a stretch without.
+    pub hidden: Vec<Point3<f64>>,
     /// The tube's points: all, or so many that they lie 0.2 tube radii apart or closer.
     pub thin: PointCloud,
     /// Indices of the cloud's points that are the tube's, ascending; None when nothing else was seen: all are.
@@ -243,7 +245,7 @@ fn choose(mut tubes: Vec<Tube>, nominal: Option<&Nominal>) -> Result<(Tube, Vec<
 fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, warnings: Vec<String>) -> Scene {
     let Tube { radius_mm, polygon, around, .. } = tube;
     let vertices = polygon.len();
-    let polygon = reach::drawn_on(polygon, SPINE_SPACING_RADII * radius_mm, radius_mm, &rest.cloud);
+    let (polygon, hidden) = reach::drawn_on(polygon, SPINE_SPACING_RADII * radius_mm, radius_mm, &rest.cloud);
     let same = polygon.len() == vertices;
     let around = if same { around } else { Surroundings::new(&polygon, radius_mm) };
     let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
@@ -261,5 +263,5 @@ fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, war
         }
         _ => rest.cloud.select(&near),
     };
-    Scene { radius_mm, polygon, thin, own, faces, warnings }
+    Scene { radius_mm, polygon, hidden, thin, own, faces, warnings }
 }

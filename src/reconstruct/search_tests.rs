@@ -7,7 +7,9 @@ use super::evidence::Solved;
 use super::fit::{Data, RadiusPrior, Way, descend};
 use super::flattening::freed;
 use super::model::{Flattening, Parameter, TubeModel, Wall};
-use super::moves::{doubled, drawn_apart, is_one, merged, shallow_pairs, with_wide_doubled, without_bend};
+use super::moves::{
+    doubled, drawn_apart, is_one, merged, shallow_pairs, with_wide_doubled, without_bend, without_detours,
+};
 use super::normal;
 use super::reach::reaching;
 use super::sections::CentreLine;
@@ -256,4 +258,33 @@ fn shallow_bends_close_together_are_doubted() {
     assert_eq!(pairs(9.9, 0.02), [1]);
     assert!(pairs(10.1, 0.02).is_empty(), "a tube radius between");
     assert!(pairs(9.9, 0.34).is_empty(), "not shallow");
+}
+
+#[test]
+fn a_row_of_bends_that_leads_nowhere_is_pulled_straight() {
+    // Aside by 2 mm and back again, between two bends.
+    let detour = |roll: f64| {
+        let shallow = |length_mm, turn, angle| Bend { radius_mm: 20.0, ..bend(length_mm, turn, angle) };
+        let half_turn = std::f64::consts::PI;
+        let way = [shallow(40.0, roll, 0.2), shallow(1.0, half_turn, 0.4), shallow(1.0, half_turn, 0.2)];
+        [&[bend(100.0, 0.0, 1.2)], &way[..], &[bend(45.0, -0.7, 0.9)]].concat()
+    };
+    for roll in [0.0, 1.0, -2.5] {
+        let model = tube(detour(roll));
+        let rows = without_detours(&model);
+        assert_eq!(rows.len(), 1);
+        let (row, straight) = &rows[0];
+        assert_eq!((row.clone(), straight.lra.bends.len()), (1..=3, 2));
+        let (spine, before) = (straight.spine(), model.spine());
+        let ends = [0.0, 1.0].map(|share| {
+            let at = |s: &crate::tube::Spine| s.frame_at(share * s.length_mm()).translation.vector;
+            (at(&spine) - at(&before)).norm()
+        });
+        assert!(ends.iter().all(|off| *off < 1.0), "{roll}: {ends:?}");
+    }
+    // A real offset bend, and an S, stay.
+    assert!(
+        without_detours(&tube(vec![bend(100.0, 0.0, 0.5), bend(5.0, 3.1, 0.5), bend(50.0, 0.3, 0.4)]))
+            .is_empty()
+    );
 }

@@ -12,6 +12,7 @@ use super::model::{Flattening, Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::{
     is_free_form, mean_radius_mm, merged, shallow_pairs, with_common_radius, with_wide_doubled, without_bend,
+    without_detours,
 };
 use super::profile::{Held, lengths};
 use super::reach::reaching;
@@ -37,8 +38,11 @@ const ARC_FACTOR: f64 = 2.5;
 /// Candidates whose scores differ by less are one: about what a fit leaves unresolved.
 const SAME_SCORE: f64 = 0.01;
 
-/// Where a tube strays farther from the polygon, in radii, the points of its sections do not lie on one section.
+/// Where a tube strays farther from the polygon, in radii, the points of its sections do not lie on one section; and still
+/// farther it has lost its way: the sections there are measured as if nothing had been fitted.
 const STRAYED_RADII: f64 = 0.03;
+
+const LOST_RADII: f64 = 0.2;
 
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
@@ -60,6 +64,8 @@ const MEASUREMENTS: usize = 4;
 pub struct Shown<'a> {
     /// Vertices along the centre line.
     pub polygon: &'a [Point3<f64>],
+    /// Ends of it beyond which points go on behind a stretch without.
+    pub hidden: &'a [Point3<f64>],
     /// Some of the tube's points.
     pub sample: &'a [Point3<f64>],
     /// Tube radius, good to about a hundredth.
@@ -76,6 +82,7 @@ impl<'a> Shown<'a> {
         let whole = Whole::new(cloud, scene.own.as_deref());
         Shown {
             polygon: &scene.polygon,
+            hidden: &scene.hidden,
             sample,
             radius_mm: scene.radius_mm,
             flattening: Flattening::NONE,
@@ -108,8 +115,9 @@ pub struct Structure {
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(shown: &Shown) -> Option<Structure> {
     let Shown { polygon, sample, radius_mm, whole, .. } = *shown;
+    let way = CentreLine::of_polygon(polygon, radius_mm);
     let mut jury = Jury {
-        line: CentreLine::of_polygon(polygon, radius_mm),
+        line: way.clone(),
         correlation: 1.0,
         prior: None,
         decisions: Vec::new(),
@@ -135,12 +143,18 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     let mut best = jury.judge(clearest.model.clone());
     for _ in 0..MEASUREMENTS {
         best.model = reaching(&best.model, sample);
-        jury.line = CentreLine::measure(sample, &best.model, true);
+        // Far from its polygon a tube's sections would take its own points for strangers'.
+        let strays = way.farthest_mm(&best.model) > LOST_RADII * radius_mm;
+        jury.line = CentreLine::measure(sample, &best.model, !strays);
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
         jury.correlation = jury.line.correlation(&best.model);
         best = jury.judge(best.model);
         let before = best.clone();
         best = jury.search(best);
+        if let Some(straight) = jury.without_detour(sample, &best) {
+            best = straight;
+            continue;
+        }
         // The search may have learned how many points say one thing: what was before is judged by that, too.
         if best.bends() == before.bends() && best.score >= jury.judge(before.model).score {
             break;
@@ -186,6 +200,25 @@ impl Jury {
         (self.decisions, self.correlation) = (before, correlation);
         self.decide(what, None, gain, false);
         best
+    }
+
+    /// The tube without a row of bends that leads back onto the line before it, where the points are as well explained without:
+    /// the sections, taken about that row, would not tell.
+    fn without_detour(&mut self, sample: &[Point3<f64>], best: &Candidate) -> Option<Candidate> {
+        let rows = without_detours(&best.model);
+        if rows.is_empty() {
+            return None;
+        }
+        let mut sample = Sample::new(sample.to_vec(), &best.model);
+        let (_, before) = self.fit_points(&mut sample, &best.model);
+        let fitted = rows.into_iter().map(|(row, model)| (row, self.fit_points(&mut sample, &model)));
+        let (row, (fit, score)) = fitted.min_by(|a, b| a.1.1.total_cmp(&b.1.1)).filter(|l| l.1.1 < before)?;
+        let at_mm = |i: usize| best.model.spine().segments()[2 * i + 1].start_mm;
+        let (from_mm, to_mm) = (at_mm(*row.start()), at_mm(*row.end()));
+        let what =
+            format!("the bends between {from_mm:.0} and {to_mm:.0} mm, which lead nowhere, pulled straight");
+        self.decide(what, None, before - score, true);
+        Some(self.judge(fit.model))
     }
 
     /// Bends that know their own CLR.
