@@ -127,9 +127,12 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
     }
 }
 
-/// After a step this small, in standard deviations of the estimate, what is left is none: Newton's steps shrink by far more than
-/// the square of this.
-const LAST_STEP_SIGMAS: f64 = 0.3;
+/// After a step this small, in standard deviations of the estimate (of all values together), what is left is none.
+const LAST_STEP_SIGMAS: f64 = 1.0;
+
+/// A first step along a direction that the points tell badly may be so long that it bends away from where it leads; the next then
+/// is longer, and brings it back. From this pass on steps shrink.
+const SHRINKING: usize = 3;
 
 /// A step that leaves less than this share of the points on the tube leads astray.
 const LEAST_KEPT: f64 = 0.95;
@@ -181,7 +184,7 @@ pub fn polish(
                 passes,
             });
         }
-        if size > 0.5 * before || pass.cost > cost {
+        if passes >= SHRINKING && (size > 0.5 * before || pass.cost > cost) {
             return None;
         }
         (before, cost) = (size, pass.cost);

@@ -174,12 +174,21 @@ impl Local {
 
     /// How oval the section is where a point faces the segment: [`Arc::ramp`].
     pub fn ramp_at(&self, p: [f64; 3], tube_radius_mm: f64) -> f64 {
-        let Some(arc) = &self.arc else { return 0.0 };
+        match &self.arc {
+            None => 0.0,
+            Some(_) => self.place_on_ramp(p, tube_radius_mm).map_or(1.0, |(_, share)| oval_share(share)),
+        }
+    }
+
+    /// Where a point that faces an arc lies on one of its ramps: whether on that at its end, and how far, 0 to 1 inwards. None
+    /// where the arc is as oval as it gets, and on a line.
+    pub fn place_on_ramp(&self, p: [f64; 3], tube_radius_mm: f64) -> Option<(bool, f64)> {
+        let arc = self.arc.as_ref()?;
         let (x, y) = (p[0], arc.radius_mm - p[1]);
         if self.oval.holds(x, y) {
-            return 1.0;
+            return None;
         }
-        arc.ramp(x.atan2(y).rem_euclid(std::f64::consts::TAU), tube_radius_mm)
+        Some(arc.place_on_ramp(x.atan2(y).rem_euclid(std::f64::consts::TAU), tube_radius_mm))
     }
 
     /// How oval the section is at a distance along the segment, and how flat its outer wall.
@@ -235,18 +244,29 @@ impl Outline {
 
 impl Arc {
     /// Over what length from its ends the section becomes as oval as it gets.
-    fn full_ramp_mm(&self, tube_radius_mm: f64) -> f64 {
+    pub fn full_ramp_mm(&self, tube_radius_mm: f64) -> f64 {
         (OVAL_RAMP_RADII * tube_radius_mm).min(0.5 * self.angle_rad * self.radius_mm)
     }
 
-    /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is
-    /// left out of the derivatives: where the model holds residuals are noise, so this costs nothing but a little
-    /// speed of convergence, on arcs that are not all ramp (`TubeModel::may_be_oval`).
+    /// How oval the section is at a turn from the arc's start: 0 at its ends, 1 inside. Its own slope along the tube is in the
+    /// derivatives where the ramps are told apart (`ramps`), for the fit of all points. A sample's fit leaves it out: where the
+    /// model holds residuals are noise, so that costs a little speed of convergence.
     pub fn ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> f64 {
-        let from_end = turn_rad.min(self.angle_rad - turn_rad) * self.radius_mm;
-        let full = self.full_ramp_mm(tube_radius_mm);
-        0.5 - 0.5 * (std::f64::consts::PI * (from_end / full.max(1e-12)).clamp(0.0, 1.0)).cos()
+        oval_share(self.place_on_ramp(turn_rad, tube_radius_mm).1)
     }
+
+    /// Whether a turn from the arc's start is nearer to its end, and how far inwards on the ramp there, 0 to 1.
+    fn place_on_ramp(&self, turn_rad: f64, tube_radius_mm: f64) -> (bool, f64) {
+        let left_rad = self.angle_rad - turn_rad;
+        let full = self.full_ramp_mm(tube_radius_mm);
+        let share = turn_rad.min(left_rad) * self.radius_mm / full.max(1e-12);
+        (left_rad < turn_rad, share.clamp(0.0, 1.0))
+    }
+}
+
+/// How oval the section is at a share of a ramp.
+pub fn oval_share(share: f64) -> f64 {
+    0.5 - 0.5 * (std::f64::consts::PI * share).cos()
 }
 
 impl Local {

@@ -39,6 +39,7 @@ mod passes;
 mod places;
 mod profile;
 pub mod radius;
+mod ramps;
 mod reach;
 mod realign;
 pub mod scene;

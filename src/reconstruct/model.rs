@@ -6,7 +6,7 @@
 
 use nalgebra::{DVector, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
-use super::moments::{FLATTENING, OVALITY, OWN_RADIUS, TUBE_RADIUS};
+use super::moments::{FLATTENING, OVALITY, OWN_ANGLE, OWN_RADIUS, TUBE_RADIUS};
 use crate::recognize::median;
 use crate::tube::{Frame, Lra, SegmentKind, Spine, wrap_angle};
 
@@ -298,7 +298,9 @@ fn motions(parameter: &Parameter, spine: &Spine) -> Vec<Motion> {
         Parameter::Angle(i) => {
             let arc = &segments[2 * i + 1];
             let centre = arc.centre().unwrap_or_else(|| arc.start.translation.vector.into());
-            twist(2 * i + 2, turn(arc.start.rotation * Vector3::z(), centre))
+            let behind = turn(arc.start.rotation * Vector3::z(), centre);
+            let own = Motion::Own { segment: 2 * i + 1, row: OWN_ANGLE };
+            vec![Motion::Twist { from: 2 * i + 2, twist: behind }, own]
         }
         Parameter::BendRadius(i) => bend_radius(spine, i).into(),
         Parameter::CommonRadius => (0..segments.len() / 2).flat_map(|i| bend_radius(spine, i)).collect(),

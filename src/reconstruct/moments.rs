@@ -14,6 +14,8 @@ use rayon::prelude::*;
 use super::lanes::Adder;
 use super::local::{prepare, settle};
 use super::model::TubeModel;
+use super::normal::symmetric;
+use super::ramps::Ramps;
 
 /// Points per chunk of a sum.
 pub(super) const CHUNK: usize = 1024;
@@ -35,8 +37,12 @@ pub const TUBE_RADIUS: usize = 8;
 pub const RESIDUAL: usize = 9;
 /// See [`OWN_RADIUS`].
 pub const FLATTENING: usize = 10;
+/// What the arc's angle does to the ramp at its end.
+pub const OWN_ANGLE: usize = 11;
+/// How oval a stretch of a ramp is beside what the model says, see [`Pass::doubting`].
+pub const DOUBT: usize = 12;
 /// Rows of a moment.
-pub const SQUARE: usize = 11;
+pub const SQUARE: usize = 13;
 
 /// The derivatives and the residual, squared.
 pub type Moment = SMatrix<f64, SQUARE, SQUARE>;
@@ -46,6 +52,8 @@ pub type Moment = SMatrix<f64, SQUARE, SQUARE>;
 pub struct Pass {
     /// Per segment, lower triangles.
     pub moments: Vec<Moment>,
+    /// Of stretches where sections turn oval, those that were asked for.
+    pub(super) ramps: Vec<Moment>,
     /// Robust cost (Tukey's biweight), in mm^2.
     pub cost: f64,
     /// Sum of weights.
@@ -155,8 +163,9 @@ impl Sample {
     /// Sums residuals and their derivatives with the biweight of cut-off `cutoff_mm`.
     pub fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
         let locals = prepare(model);
+        let ramps = Ramps::none(locals.len());
         let sum = |(points, segments): (&[Point3<f64>], &mut [u32])| {
-            let mut adder = Adder::new(&locals, model, cutoff_mm);
+            let mut adder = Adder::new(&locals, &ramps, model, cutoff_mm);
             for (p, segment) in points.iter().zip(segments) {
                 let local = settle(p, segment, &locals);
                 adder.add(*segment as usize, local.into());
@@ -172,7 +181,16 @@ impl Pass {
     /// No points yet.
     pub fn empty(segments: usize) -> Pass {
         let moments = vec![Moment::zeros(); segments];
-        Pass { moments, cost: 0.0, weight: 0.0, psi_squared: 0.0, psi_slope: 0.0, sizes: Sizes::default() }
+        let ramps = Vec::new();
+        Pass {
+            moments,
+            ramps,
+            cost: 0.0,
+            weight: 0.0,
+            psi_squared: 0.0,
+            psi_slope: 0.0,
+            sizes: Sizes::default(),
+        }
     }
 
     /// The sums of all parts, added in order.
@@ -197,7 +215,25 @@ impl Pass {
         (self.weight / self.psi_slope.max(1e-12)).clamp(1.0, 1.5)
     }
 
+    /// The sums with the ovality of every stretch of the ramps free within what is known of it, and eliminated: how a section turns
+    /// oval along the tube is not known well enough to tell where the bend is. `noise_mm`: standard deviation of a point.
+    pub(super) fn doubting(mut self, ramps: &Ramps, noise_mm: f64) -> Pass {
+        for (moment, (segment, doubt_mm)) in std::mem::take(&mut self.ramps).iter().zip(ramps.doubts()) {
+            let mut moment = symmetric(moment);
+            let column = moment.column(DOUBT).into_owned();
+            let square = column[DOUBT] + (noise_mm / doubt_mm).powi(2);
+            moment -= column * column.transpose() / square;
+            moment.row_mut(DOUBT).fill(0.0);
+            moment.column_mut(DOUBT).fill(0.0);
+            self.moments[segment] += moment.lower_triangle();
+            self.cost -= 0.5 * column[RESIDUAL].powi(2) / square;
+        }
+        self
+    }
+
     fn merge(&mut self, other: &Pass) {
+        self.ramps.resize(self.ramps.len().max(other.ramps.len()), Moment::zeros());
+        self.ramps.iter_mut().zip(&other.ramps).for_each(|(a, b)| *a += b);
         self.moments.iter_mut().zip(&other.moments).for_each(|(a, b)| *a += b);
         self.cost += other.cost;
         self.weight += other.weight;
@@ -288,6 +324,38 @@ mod tests {
                 let analytic = gradient[j] / r;
                 let scale = 1.0 + numeric[j].abs();
                 prop_assert!((analytic - numeric[j]).abs() < 1e-4 * scale, "{parameter:?}: {analytic} {}", numeric[j]);
+            }
+        }
+
+        #[test]
+        fn on_ramps_that_are_told_apart_they_are_too(
+            inwards in 0.05..0.95f64, bend in 0..3usize, at_end in any::<bool>(), around in 0.0..std::f64::consts::TAU,
+            off in -1.0..1.0f64, common in any::<bool>(),
+        ) {
+            let model = TubeModel { common_radius: common, ..model(common) };
+            let parameters = model.parameters();
+            let arc = model.spine().segments()[2 * bend + 1];
+            let inwards_mm = inwards * (0.5 * arc.length_mm).min(model.tube_radius_mm);
+            let at_mm = arc.start_mm + if at_end { arc.length_mm - inwards_mm } else { inwards_mm };
+            let p = near_surface(&model, at_mm / model.spine().length_mm(), around, off);
+            let (locals, ramps) = (prepare(&model), Ramps::of(&model));
+            let mut segment = 2 * bend as u32 + 1;
+            let local = settle(&p, &mut segment, &locals);
+            let mut adder = Adder::new(&locals, &ramps, &model, 1e6);
+            adder.add(segment as usize, local.into());
+            // So noisy a point doubts nothing.
+            let pass = adder.finish().doubting(&ramps, 1e9);
+            let (_, gradient) = normal::equations(&pass.moments, &model, &parameters);
+            let distance = |m: &TubeModel| Sample::new(vec![p], m).residuals(m)[0];
+            let r = distance(&model);
+            prop_assume!(r.abs() > 1e-3);
+            let h = 1e-6;
+            for (j, parameter) in parameters.iter().enumerate() {
+                let step = |d: f64| DVector::from_fn(parameters.len(), |k, _| if k == j { d } else { 0.0 });
+                let at = |d: f64| distance(&model.moved(&parameters, &step(d)));
+                let numeric = (at(h) - at(-h)) / (2.0 * h);
+                let analytic = gradient[j] / r;
+                prop_assert!((analytic - numeric).abs() < 1e-4 * (1.0 + numeric.abs()), "{parameter:?}: {analytic} {numeric}");
             }
         }
 

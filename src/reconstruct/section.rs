@@ -27,8 +27,9 @@ const LONGEST_RADII: f64 = 2.0;
 pub const SPREADS: [f64; VALUES] = [0.01, 0.3, 0.3, 0.02, 0.02];
 /// How far a section's ovality may differ from the model's, in tube radii; beside the tangent points, where it grows in
 /// some way or other, also this share of the bend's; and how far beside.
-const OVAL_DOUBT: f64 = 1e-5;
-const OVAL_DOUBT_SHARE: f64 = 0.15;
+pub const OVAL_DOUBT: f64 = 1e-5;
+/// See [`OVAL_DOUBT`].
+pub const OVAL_DOUBT_SHARE: f64 = 0.15;
 const OVAL_DOUBT_RADII: f64 = 1.2;
 /// How oval a bend may be that is too short to tell, in tube radii; sections that lie on it hardly reach beyond it by this.
 pub const OVAL_UNTOLD: f64 = 0.02;

@@ -6,12 +6,13 @@
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-use super::fit::Data;
+use super::fit::{CUTOFF_SIGMAS, Data};
 use super::lanes::Adder;
 use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
 use super::moderate::drawn;
 use super::moments::{CHUNK, Pass};
+use super::ramps::Ramps;
 use crate::cloud::PointCloud;
 use crate::tube::{Frame, Spine};
 
@@ -226,26 +227,30 @@ fn joined<T>(parts: Vec<Vec<T>>) -> Vec<T> {
 
 impl Data for Whole<'_> {
     fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
-        let locals = prepare(model);
-        let new = || Adder::new(&locals, model, cutoff_mm);
+        let (locals, ramps) = (prepare(model), Ramps::of(model));
+        let new = || Adder::new(&locals, &ramps, model, cutoff_mm);
         let parts = self.walk(model, cutoff_mm, new, |adder, segment, p| adder.add(segment, p));
-        Pass::total(locals.len(), parts.into_iter().map(Adder::finish))
+        let total = Pass::total(locals.len(), parts.into_iter().map(Adder::finish));
+        total.doubting(&ramps, cutoff_mm / CUTOFF_SIGMAS)
     }
 }
 
 impl Whole<'_> {
     /// The sums of each pass by itself.
     pub fn by_pass(&self, model: &TubeModel, cutoff_mm: f64) -> Vec<Pass> {
-        let locals = prepare(model);
+        let (locals, ramps) = (prepare(model), Ramps::of(model));
         let count = self.passes.len().max(1);
-        let new = || (0..count).map(|_| Adder::new(&locals, model, cutoff_mm)).collect::<Vec<_>>();
+        let new = || (0..count).map(|_| Adder::new(&locals, &ramps, model, cutoff_mm)).collect::<Vec<_>>();
         let add = |adders: &mut Vec<Adder>, pass: usize, segment: usize, p: [f64; 3]| {
             adders[pass].add(segment, p);
         };
         let parts = self.walk_passes(model, cutoff_mm, new, add);
         let finished: Vec<Vec<Pass>> =
             parts.into_iter().map(|part| part.into_iter().map(Adder::finish).collect()).collect();
-        let of = |pass: usize| Pass::total(locals.len(), finished.iter().map(|part| part[pass].clone()));
+        let of = |pass: usize| {
+            let total = Pass::total(locals.len(), finished.iter().map(|part| part[pass].clone()));
+            total.doubting(&ramps, cutoff_mm / CUTOFF_SIGMAS)
+        };
         (0..count).map(of).collect()
     }
 }
@@ -339,6 +344,7 @@ pub fn residuals_mm(cloud: &PointCloud, model: &TubeModel) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::reconstruct::fit::{Effort, fit};
     use crate::reconstruct::moments::Sample;
     use crate::tube::{Bend, Lra};
 
@@ -377,9 +383,15 @@ mod tests {
         }
     }
 
+    /// Without ramps, which samples do not doubt.
+    fn round_case(points: usize) -> (TubeModel, PointCloud) {
+        let (model, cloud) = case(points);
+        (TubeModel { ovality_mm: vec![0.0; 3], ..model }, cloud)
+    }
+
     #[test]
     fn the_pass_is_the_samples() {
-        let (model, cloud) = case(5000);
+        let (model, cloud) = round_case(5000);
         let own: Vec<u32> = (0..cloud.len() as u32).filter(|i| !i.is_multiple_of(3)).collect();
         let points = own.iter().map(|&i| cloud.point(i as usize)).collect();
         let expected = Sample::new(points, &model).pass(&model, 0.2);
@@ -391,9 +403,48 @@ mod tests {
         }
     }
 
+    /// Half the surface of an S whose sections turn oval evenly and late, and round again soon, not as the model has it.
+    fn another_ramp(model: &TubeModel) -> PointCloud {
+        let spine = model.spine();
+        let oval_mm = |at: f64| {
+            let bends = spine.segments().iter().enumerate().skip(1).step_by(2);
+            let inside = bends.map(|(k, arc)| {
+                let from_start = (at - arc.start_mm) / (1.4 * model.tube_radius_mm);
+                let from_end = (arc.start_mm + arc.length_mm - at) / (0.6 * model.tube_radius_mm);
+                from_start.min(from_end).clamp(0.0, 1.0) * model.ovality_mm[k / 2]
+            });
+            inside.sum::<f64>()
+        };
+        let place = |i: usize| {
+            let at = (0.618_034 * i as f64).fract() * spine.length_mm();
+            let turn = 3.0 * (0.414_214 * i as f64).fract();
+            // The outside of a bend is at -y.
+            let noise_mm = 0.04 * (1.7 * i as f64).sin();
+            let radius = model.tube_radius_mm + oval_mm(at) * (2.0 * turn).cos() + noise_mm;
+            spine.frame_at(at) * Point3::new(0.0, radius * turn.cos(), radius * turn.sin())
+        };
+        PointCloud::from_points(&(0..40_000).map(place).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn how_sections_turn_oval_does_not_tell_where_the_bends_are() {
+        let bend =
+            |length_mm, rotation_rad, angle_rad| Bend { length_mm, rotation_rad, angle_rad, radius_mm: 30.0 };
+        let bends = vec![bend(80.0, 0.0, 1.2), bend(15.0, std::f64::consts::PI, 1.1)];
+        let mut model = TubeModel::round(Frame::identity(), Lra { bends, last_length_mm: 70.0 }, 10.0);
+        model.ovality_mm = vec![-0.3, -0.25];
+        let cloud = another_ramp(&model);
+        let effort = Effort { cutoff_mm: 0.2, rounds: 0, steps: 30, prior: None };
+        let off_mm = |found: &TubeModel| (found.lra.bends[1].length_mm - 15.0).abs();
+        let exact = fit(&mut Sample::new(cloud.iter().collect(), &model), &model, effort);
+        let doubting = fit(&mut Whole::new(&cloud, None), &model, effort);
+        let (exact_mm, doubting_mm) = (off_mm(&exact.model), off_mm(&doubting.model));
+        assert!(doubting_mm < 0.2 * exact_mm && exact_mm > 0.01, "{doubting_mm} {exact_mm}");
+    }
+
     #[test]
     fn passes_are_walked_where_they_belong() {
-        let (model, cloud) = case(5000);
+        let (model, cloud) = round_case(5000);
         let motion = Frame::new(Vector3::new(0.1, -0.2, 0.05), Vector3::new(1e-3, 0.0, -2e-3));
         let passes = [
             ScanPass { end: 1500, motion: Frame::identity() },
