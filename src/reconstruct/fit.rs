@@ -239,7 +239,7 @@ const MOST_DAMPING: f64 = 1e6;
 const RESOLVED: f64 = 0.03;
 
 /// A step that gains less than this share of what an undamped one promises leads nowhere.
-const LEAST_SHARE: f64 = 1e-4;
+const LEAST_SHARE: f64 = 5e-3;
 
 /// Steps beyond a place where none leads down, and times that they are tried.
 const LEAP_STEPS: usize = 6;
@@ -298,7 +298,7 @@ impl<D: Data> Ground<'_, D> {
         None
     }
 
-    /// Undamped steps, up or down, until one stands lower than where no step led down: the derivatives leave out how a
+    /// Undamped steps, up or down, until one stands lower than where no step led down: a sample's derivatives leave out how a
     /// section's ovality grows along the tube, and so point a little past the way that the cost takes.
     fn leap(&mut self, from: &Stand) -> Option<Stand> {
         let mut at = None::<Stand>;
