@@ -23,6 +23,7 @@ pub mod fit;
 mod flattening;
 mod follow;
 mod guided;
+mod in_order;
 mod lanes;
 mod likeness;
 mod local;

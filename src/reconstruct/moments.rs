@@ -231,7 +231,7 @@ impl Pass {
         self
     }
 
-    fn merge(&mut self, other: &Pass) {
+    pub(super) fn merge(&mut self, other: &Pass) {
         self.ramps.resize(self.ramps.len().max(other.ramps.len()), Moment::zeros());
         self.ramps.iter_mut().zip(&other.ramps).for_each(|(a, b)| *a += b);
         self.moments.iter_mut().zip(&other.moments).for_each(|(a, b)| *a += b);

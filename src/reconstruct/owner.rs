@@ -63,7 +63,7 @@ impl Surroundings {
             nearest: vec![NOWHERE; size.iter().product()],
             window: 6,
         };
-        let mut squares = vec![f64::INFINITY; around.nearest.len()];
+        let mut squares = vec![f32::INFINITY; around.nearest.len()];
         let last = drawn_out.len() - 2;
         for (k, edge) in drawn_out.windows(2).enumerate() {
             match k {
@@ -82,7 +82,7 @@ impl Surroundings {
     }
 
     /// Enters a place into the cells within its reach.
-    fn mark(&mut self, place: &Point3<f64>, reach_mm: f64, squares: &mut [f64]) {
+    fn mark(&mut self, place: &Point3<f64>, reach_mm: f64, squares: &mut [f32]) {
         let index = self.places.len() as u32;
         self.places.push(*place);
         // A cell counts when any of its points may.
@@ -103,8 +103,8 @@ impl Surroundings {
                 let row = (z * self.size[1] + y) * self.size[0];
                 for x in range(0) {
                     let square = beside + off(x, 0);
-                    if square <= cells * cells && square < squares[row + x] {
-                        squares[row + x] = square;
+                    if square <= cells * cells && (square as f32) < squares[row + x] {
+                        squares[row + x] = square as f32;
                         self.nearest[row + x] = index;
                     }
                 }

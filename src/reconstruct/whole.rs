@@ -4,9 +4,9 @@
 //! always the same segment, and the surface there tells. Only where it does not are all segments asked.
 
 use nalgebra::{Point3, Vector3};
-use rayon::prelude::*;
 
 use super::fit::{CUTOFF_SIGMAS, Data};
+use super::in_order::in_order;
 use super::lanes::Adder;
 use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
@@ -153,31 +153,36 @@ impl<'a> Whole<'a> {
         new: impl Fn() -> S + Sync,
         add: impl Fn(&mut S, usize, usize, [f64; 3]) + Sync,
     ) -> Vec<S> {
+        let mut out = Vec::new();
+        self.walk_in_order((model, near_mm), new, add, |part| part, |part| out.push(part));
+        out
+    }
+
+    /// The same from `near_mm` of the model; each chunk's part is `done` with at once and given to `take` in order.
+    fn walk_in_order<S, R: Send>(
+        &self,
+        (model, near_mm): (&TubeModel, f64),
+        new: impl Fn() -> S + Sync,
+        add: impl Fn(&mut S, usize, usize, [f64; 3]) + Sync,
+        done: impl Fn(S) -> R + Sync,
+        take: impl FnMut(R) + Send,
+    ) {
         let walk = Walk::new(model, self.cloud.origin(), near_mm, self.passes);
         let chunk = self.len().div_ceil(MOST_CHUNKS).max(CHUNK);
-        let through = |points: &mut dyn Iterator<Item = (u32, [f32; 3])>| {
+        let all = self.cloud.offsets();
+        let through = |k: usize| {
             let (mut sums, mut segment, mut pass) = (new(), 0, 0);
-            for (index, offset) in points {
+            for i in k * chunk..((k + 1) * chunk).min(self.len()) {
+                let index = self.index(i);
                 while self.passes.get(pass).is_some_and(|p| index >= p.end) && pass + 1 < self.passes.len() {
                     pass += 1;
                 }
-                let place = walk.find(offset, pass, &mut segment);
+                let place = walk.find(all[index as usize], pass, &mut segment);
                 add(&mut sums, pass, segment, place);
             }
-            sums
+            done(sums)
         };
-        let all = self.cloud.offsets();
-        match self.own {
-            None => all
-                .par_chunks(chunk)
-                .enumerate()
-                .map(|(k, part)| through(&mut ((k * chunk) as u32..).zip(part.iter().copied())))
-                .collect(),
-            Some(own) => own
-                .par_chunks(chunk)
-                .map(|part| through(&mut part.iter().map(|&i| (i, all[i as usize]))))
-                .collect(),
-        }
+        in_order(self.len().div_ceil(chunk), through, take);
     }
 
     /// The points of the first and of the last straight that lie no farther along it than `first_mm`, or no farther
@@ -229,8 +234,9 @@ impl Data for Whole<'_> {
     fn pass(&mut self, model: &TubeModel, cutoff_mm: f64) -> Pass {
         let (locals, ramps) = (prepare(model), Ramps::of(model));
         let new = || Adder::new(&locals, &ramps, model, cutoff_mm);
-        let parts = self.walk(model, cutoff_mm, new, |adder, segment, p| adder.add(segment, p));
-        let total = Pass::total(locals.len(), parts.into_iter().map(Adder::finish));
+        let add = |adder: &mut Adder, _: usize, segment: usize, p: [f64; 3]| adder.add(segment, p);
+        let mut total = Pass::empty(locals.len());
+        self.walk_in_order((model, cutoff_mm), new, add, Adder::finish, |part| total.merge(&part));
         total.doubting(&ramps, cutoff_mm / CUTOFF_SIGMAS)
     }
 }
@@ -244,14 +250,12 @@ impl Whole<'_> {
         let add = |adders: &mut Vec<Adder>, pass: usize, segment: usize, p: [f64; 3]| {
             adders[pass].add(segment, p);
         };
-        let parts = self.walk_passes(model, cutoff_mm, new, add);
-        let finished: Vec<Vec<Pass>> =
-            parts.into_iter().map(|part| part.into_iter().map(Adder::finish).collect()).collect();
-        let of = |pass: usize| {
-            let total = Pass::total(locals.len(), finished.iter().map(|part| part[pass].clone()));
-            total.doubting(&ramps, cutoff_mm / CUTOFF_SIGMAS)
-        };
-        (0..count).map(of).collect()
+        let done = |adders: Vec<Adder>| adders.into_iter().map(Adder::finish).collect::<Vec<_>>();
+        let mut totals = vec![Pass::empty(locals.len()); count];
+        let take =
+            |parts: Vec<Pass>| totals.iter_mut().zip(&parts).for_each(|(total, part)| total.merge(part));
+        self.walk_in_order((model, cutoff_mm), new, add, done, take);
+        totals.into_iter().map(|total| total.doubting(&ramps, cutoff_mm / CUTOFF_SIGMAS)).collect()
     }
 }
 
