@@ -57,7 +57,7 @@ async fn bender(profile: &Profile, bends: u16, fault: Option<Fault>) -> Simulate
 }
 
 fn link(profile: Profile, to: &SimulatedBender) -> ModbusLink {
-    ModbusLink::new(profile, to.address().to_string())
+    ModbusLink::new(profile, to.address().to_string()).unwrap()
 }
 
 #[tokio::test]
@@ -174,7 +174,7 @@ async fn a_late_answer_is_never_taken_for_the_next_one() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let mut profile = profile();
     profile.deadlines.request = Duration::from_millis(100);
-    let mut link = ModbusLink::new(profile, listener.local_addr().unwrap().to_string());
+    let mut link = ModbusLink::new(profile, listener.local_addr().unwrap().to_string()).unwrap();
     let (timed_out, wait) = tokio::sync::oneshot::channel();
     let server = tokio::spawn(async move {
         let (mut first, _) = listener.accept().await.unwrap();
@@ -209,7 +209,7 @@ async fn replies_that_do_not_fit_drop_the_connection_and_the_next_one_is_fine() 
     ];
     for (name, pdu) in wrong {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let mut link = ModbusLink::new(profile(), listener.local_addr().unwrap().to_string());
+        let mut link = ModbusLink::new(profile(), listener.local_addr().unwrap().to_string()).unwrap();
         let server = tokio::spawn(async move {
             let (mut first, _) = listener.accept().await.unwrap();
             let (transaction, _) = request(&mut first).await.unwrap();
@@ -229,7 +229,7 @@ async fn replies_that_do_not_fit_drop_the_connection_and_the_next_one_is_fine() 
 #[tokio::test]
 async fn busy_is_asked_again_a_few_times_and_then_reported() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let mut link = ModbusLink::new(profile(), listener.local_addr().unwrap().to_string());
+    let mut link = ModbusLink::new(profile(), listener.local_addr().unwrap().to_string()).unwrap();
     let server = tokio::spawn(async move {
         let (mut stream, _) = listener.accept().await.unwrap();
         let mut requests = 0;
@@ -253,7 +253,28 @@ async fn nobody_there_is_one_clear_error() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
     drop(listener);
-    let error = ModbusLink::new(profile(), &address).read_status().await.unwrap_err();
+    let error = ModbusLink::new(profile(), &address).unwrap().read_status().await.unwrap_err();
     assert!(matches!(error, LinkError::Connect { .. }), "{error}");
     assert!(error.to_string().contains(&address), "{error}");
+}
+
+#[tokio::test]
+async fn a_machine_that_is_not_there_is_not_called_without_pause() {
+    let address = {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        listener.local_addr().unwrap().to_string()
+    };
+    let mut profile = profile();
+    profile.deadlines.poll_ms = 60_000;
+    let mut link = ModbusLink::new(profile, &address).unwrap();
+    // The first failure may be an idle connection's end: tried again at once.
+    for _ in 0..2 {
+        let error = link.read_status().await.unwrap_err();
+        assert!(matches!(error, LinkError::Connect { .. }), "{error}");
+    }
+    let error = link.read_status().await.unwrap_err();
+    assert!(
+        matches!(error, LinkError::Resting { failures: 2, ms: 44_000..=60_000, .. }),
+        "{error}: {address} was called again"
+    );
 }

@@ -23,6 +23,18 @@ pub enum LinkError {
         /// What the system said.
         why: String,
     },
+    /// It failed a moment ago and is not tried again yet.
+    #[error(
+        "{endpoint}: not connected ({failures} failures since its last answer), the next attempt is due in {ms} ms"
+    )]
+    Resting {
+        /// Where.
+        endpoint: String,
+        /// Failures since the last answer.
+        failures: u32,
+        /// Milliseconds to the next.
+        ms: u64,
+    },
     /// No reply in time.
     #[error(
         "{endpoint}: no answer within {ms} ms when {what}; the connection was dropped, a late answer is not used"

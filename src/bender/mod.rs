@@ -9,9 +9,11 @@
 //! wire      tables to bytes and back, CRC, status word by word
 //! delivery  stage, verify, commit: events and time in, one action out
 //! driver    performs the actions on a link and a journal
+//! contact   when a link connects, asks, keeps silent: events and time in, one action out
 //! modbus    the Modbus TCP link
 //! ```
 
+mod contact;
 mod delivery;
 mod driver;
 mod limits;
@@ -21,6 +23,7 @@ mod profile;
 mod profile_file;
 mod wire;
 
+pub use contact::RulesError;
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
 pub use driver::{IntentLog, LogError, deliver};
 pub use limits::{Reason, check_limits};

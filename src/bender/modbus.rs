@@ -2,16 +2,17 @@
 //!
 //! tokio-modbus has no deadlines and checks neither the count of a read nor the echo of a write; after a
 //! timeout a TCP stream stays off by one. So each call here has a deadline, compares what came with what was
-//! asked, and keeps the connection only when all is right; the next call opens a new one. A call that is
+//! asked, and keeps the connection only when all is right; [`Contact`] says when the next one may be opened. A call that is
 //! cancelled drops its connection too, since the connection is taken out of `self` while it runs.
 
 use std::borrow::Cow;
 
 use tokio::net::TcpStream;
-use tokio::time::timeout;
+use tokio::time::{Duration, Instant, timeout_at};
 use tokio_modbus::client::{Client as _, Context, tcp};
 use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
+use super::contact::{Action, Contact, Event, Rules, RulesError, State};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::profile::Profile;
 use super::wire::{
@@ -21,60 +22,118 @@ use super::wire::{
 /// How often a device that says "busy" is asked again.
 const BUSY_RETRIES: u32 = 3;
 
+/// Between two attempts to connect no more than this share of the time in which a commit is confirmed: after it the machine
+/// must be asked.
+const LONGEST_WAIT_SHARE: u64 = 4;
+
 /// A bender behind Modbus TCP.
 pub struct ModbusLink {
     profile: Profile,
     endpoint: String,
     connection: Option<Context>,
+    contact: Contact,
+    since: Instant,
 }
 
 impl ModbusLink {
     /// A link that connects at its first use; `endpoint` is `host:port`.
-    pub fn new(profile: Profile, endpoint: impl Into<String>) -> ModbusLink {
-        ModbusLink { profile, endpoint: endpoint.into(), connection: None }
+    pub fn new(profile: Profile, endpoint: impl Into<String>) -> Result<ModbusLink, RulesError> {
+        let (endpoint, deadlines) = (endpoint.into(), &profile.deadlines);
+        let first_ms = deadlines.poll_ms;
+        let waits = (first_ms, (deadlines.confirm_ms / LONGEST_WAIT_SHARE).max(first_ms));
+        let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), None)?;
+        let contact = Contact::new(rules, u64::from(crc_of(endpoint.as_bytes())));
+        Ok(ModbusLink { profile, endpoint, connection: None, contact, since: Instant::now() })
     }
 
-    async fn connect(&mut self) -> Result<Context, LinkError> {
-        let failed = |why: String| LinkError::Connect { endpoint: self.endpoint.clone(), why };
-        let limit = self.profile.deadlines.connect;
-        let stream = timeout(limit, TcpStream::connect(&self.endpoint))
-            .await
-            .map_err(|_| failed(format!("no answer within {} ms", limit.as_millis())))?
-            .map_err(|e| failed(e.to_string()))?;
-        // Small requests wait for each other otherwise; a socket that cannot do this still works.
-        let _ = stream.set_nodelay(true);
-        Ok(tcp::attach_slave(stream, Slave(self.profile.unit_id)))
+    /// Tells the contact what happened.
+    fn on(&mut self, event: Event) -> Action {
+        self.contact.on(event, millis(self.since.elapsed()))
+    }
+
+    /// The time at a contact's millisecond.
+    fn at(&self, ms: u64) -> Instant {
+        self.since + Duration::from_millis(ms)
+    }
+
+    async fn connect(&mut self, until_ms: u64) -> Result<Context, LinkError> {
+        let opened = match timeout_at(self.at(until_ms), TcpStream::connect(&self.endpoint)).await {
+            Ok(opened) => opened.map_err(|e| e.to_string()),
+            Err(_) => Err(format!("no answer within {} ms", self.profile.deadlines.connect.as_millis())),
+        };
+        match opened {
+            Ok(stream) => {
+                // Small requests wait for each other otherwise; a socket that cannot do this still works.
+                let _ = stream.set_nodelay(true);
+                self.on(Event::Opened);
+                Ok(tcp::attach_slave(stream, Slave(self.profile.unit_id)))
+            }
+            Err(why) => {
+                self.on(Event::NotOpened);
+                Err(LinkError::Connect { endpoint: self.endpoint.clone(), why })
+            }
+        }
+    }
+
+    /// The connection, opened if need be, and until when a reply is waited for.
+    async fn ready(&mut self) -> Result<(Context, Instant), LinkError> {
+        let mut connection = self.connection.take();
+        if connection.is_none() && !matches!(self.contact.state(), State::Away { .. }) {
+            // The last call was cancelled.
+            self.on(Event::Doubted);
+        }
+        loop {
+            match (self.on(Event::Wanted), connection) {
+                (Action::Send { until_ms }, Some(open)) => return Ok((open, self.at(until_ms))),
+                (Action::Open { until_ms }, _) => connection = Some(self.connect(until_ms).await?),
+                (_, _) => return Err(self.resting()),
+            }
+        }
+    }
+
+    fn resting(&self) -> LinkError {
+        let now_ms = millis(self.since.elapsed());
+        let ms = match self.contact.state() {
+            State::Away { retry_ms } => retry_ms.saturating_sub(now_ms),
+            _ => 0,
+        };
+        LinkError::Resting { endpoint: self.endpoint.clone(), failures: self.contact.failures(), ms }
     }
 
     /// One request and its checked reply.
     async fn call(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
-        let mut connection = match self.connection.take() {
-            Some(connection) => connection,
-            None => self.connect().await?,
-        };
+        let (mut connection, until) = self.ready().await?;
         let (endpoint, what) = (self.endpoint.clone(), describe(&request));
-        let limit = self.profile.deadlines.request;
-        match timeout(limit, connection.call(request.clone())).await {
-            Err(_) => Err(LinkError::Timeout { endpoint, what, ms: limit.as_millis() }),
-            Ok(Err(error)) => Err(LinkError::Broken { endpoint, what, why: explain(&error) }),
+        let broken = |what, why| LinkError::Broken { endpoint: endpoint.clone(), what, why };
+        let (event, result) = match timeout_at(until, connection.call(request.clone())).await {
+            Err(_) => {
+                let ms = self.profile.deadlines.request.as_millis();
+                (Event::Doubted, Err(LinkError::Timeout { endpoint, what, ms }))
+            }
+            Ok(Err(error @ tokio_modbus::Error::Transport(_))) => {
+                (Event::Closed, Err(broken(what, explain(&error))))
+            }
+            Ok(Err(error)) => (Event::Doubted, Err(broken(what, explain(&error)))),
+            // A refusal is a proper answer.
             Ok(Ok(Err(exception))) => {
-                self.connection = Some(connection); // a refusal is a proper answer
-                Err(LinkError::Exception { endpoint, what, exception: name(exception) })
+                (Event::Answered, Err(LinkError::Exception { endpoint, what, exception: name(exception) }))
             }
             Ok(Ok(Ok(response))) => match fits(&request, response) {
-                Ok(words) => {
-                    self.connection = Some(connection);
-                    Ok(words)
-                }
-                Err(why) => Err(LinkError::Broken { endpoint, what, why }),
+                Ok(words) => (Event::Answered, Ok(words)),
+                Err(why) => (Event::Doubted, Err(broken(what, why))),
             },
+        };
+        self.on(event);
+        if self.contact.state() == State::Ready {
+            self.connection = Some(connection);
         }
+        result
     }
 
     /// The same for requests that may be repeated: "busy" is asked again, a few times.
     async fn call_patiently(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
         let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
-        let pause = std::time::Duration::from_millis(self.profile.deadlines.poll_ms);
+        let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
         for _ in 0..BUSY_RETRIES {
             match self.call(request.clone()).await {
                 Err(LinkError::Exception { exception, .. }) if busy.contains(&exception) => {
@@ -170,6 +229,10 @@ impl Bender for ModbusLink {
 fn chunks(address: u16, registers: usize, limit: u16) -> impl Iterator<Item = (u16, u16)> {
     let step = usize::from(limit);
     (0..registers).step_by(step).map(move |done| (address + done as u16, step.min(registers - done) as u16))
+}
+
+fn millis(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 fn words_of(bytes: &[u8]) -> Vec<u16> {

@@ -115,7 +115,7 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
     let job = Job { program, table, expected_active: None };
-    let mut link = ModbusLink::new(profile, endpoint);
+    let mut link = ModbusLink::new(profile, endpoint)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
     finish(args, &report)

@@ -66,7 +66,7 @@ pub async fn run(demo: &Demo, say: &mut (dyn FnMut(&str) + Send)) -> Result<Demo
         mode: Mode::Automatic,
         dwell: Dwell::default(),
     };
-    let link = ModbusLink::new(demo.profile.clone(), shop.address());
+    let link = ModbusLink::new(demo.profile.clone(), shop.address())?;
     let chain = Chain::new(CELL, demo.nominal.clone(), Unit::Millimetre, demo.profile.limits.clone());
     let journals = [Journal::open(&journal)?, Journal::open(&journal)?];
     let driver = Driver::new(identity, link, source, chain, journals)?;

@@ -38,6 +38,9 @@ pub enum TrialError {
     /// The cell's loop is gone.
     #[error("the cell's loop ended by itself")]
     Stopped,
+    /// The simulated bender's deadlines make no link.
+    #[error("the link to the simulated bender: {0}")]
+    Link(#[from] crate::bender::RulesError),
     /// No temporary folder, no socket.
     #[error(transparent)]
     Io(#[from] std::io::Error),
