@@ -130,15 +130,16 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
 /// After a step this small, in standard deviations of the estimate (of all values together), what is left is none.
 const LAST_STEP_SIGMAS: f64 = 1.0;
 
-/// A first step along a direction that the points tell badly may be so long that it bends away from where it leads; the next then
-/// is longer, and brings it back. From this pass on steps shrink.
-const SHRINKING: usize = 3;
+/// A step along a direction that the points tell badly may be so long that it bends away from where it leads; the next, longer in
+/// standard deviations of what the points tell well, brings it back. (Shorter steps bend as much, and take more of them.)
+/// From this pass on steps shrink.
+const SHRINKING: usize = 5;
 
 /// A step that leaves less than this share of the points on the tube leads astray.
 const LEAST_KEPT: f64 = 0.95;
 
 /// Takes a model that is nearly there to all points: Newton's steps, cut-off and all, until what is left is nothing beside
-/// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink at once or lead astray. Values that
+/// the estimate's own uncertainty. Two passes as a rule; None when the steps do not shrink or lead astray. Values that
 /// the linear equations leave open are kept within their own standard deviations (`held`).
 pub fn polish(
     data: &mut impl Data,
