@@ -11,7 +11,6 @@
 //! Nothing is queued: what cannot be asked now is refused now, so nothing is asked later than it was meant to be. No state but
 //! `Away` and `Ready`, which wait for nothing, lasts beyond a time of its own.
 
-use serde::Serialize;
 use thiserror::Error;
 
 /// The times of one link, checked.
@@ -78,8 +77,7 @@ fn unit(seed: u64) -> f64 {
 }
 
 /// Where the contact stands. Times are the caller's clock, in milliseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case", tag = "contact")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum State {
     /// Not connected.
     Away {
@@ -123,8 +121,7 @@ pub enum Event {
 }
 
 /// What is to be done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
     /// Connect, and give up then.
     Open {

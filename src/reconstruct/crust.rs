@@ -72,17 +72,28 @@ fn sound(chain: &[Point3<f64>], spacing_mm: f64, radius_mm: f64) -> Option<usize
     (1..chain.len()).find(scrap)
 }
 
+/// Direction from a point along the way that begins there.
+fn heading<'a>(
+    from: Point3<f64>,
+    way: impl Iterator<Item = &'a Point3<f64>>,
+    radius_mm: f64,
+) -> Option<Vector3<f64>> {
+    let mut along = Vector3::zeros();
+    for p in way {
+        along = p - from;
+        if along.norm() > DIRECTION_RADII * radius_mm {
+            break;
+        }
+    }
+    along.try_normalize(1e-12)
+}
+
 /// Whether a straight or one bend leads from the end of one piece to the begin of another.
 fn is_across_one_bend(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> bool {
     let (from, to) = (before[before.len() - 1], behind[0]);
-    let heading = |from: Point3<f64>, mut way: std::slice::Iter<Point3<f64>>| {
-        let far = |p: &&Point3<f64>| (*p - from).norm() > DIRECTION_RADII * radius_mm;
-        let last = way.as_slice().last().copied();
-        let to = way.find(far).copied().or(last)?;
-        (to - from).try_normalize(1e-12)
-    };
-    let backwards: Vec<Point3<f64>> = before.iter().rev().copied().collect();
-    let (Some(back), Some(on)) = (heading(from, backwards.iter()), heading(to, behind.iter())) else {
+    let (Some(back), Some(on)) =
+        (heading(from, before.iter().rev(), radius_mm), heading(to, behind.iter(), radius_mm))
+    else {
         return true;
     };
     let (out, gap) = (-back, to - from);

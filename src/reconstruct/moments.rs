@@ -2,9 +2,10 @@
 //!
 //! A rigid twist of the tube changes a point's distance by the product of its normal line's Plücker coordinates
 //! (m, p x m) with the twist (paper 004, section 2). So a point's Jacobian row is that six-vector times the
-//! segment's twist matrix, plus a few columns of its own: the arc's CLR, its ovality, the tube's radius and, where it is
-//! asked for, the arc's flattening. The sum of their outer products per segment, eleven numbers squared, is all of the
-//! points that the normal equations need: a pass costs O(points) whatever the number of bends.
+//! segment's twist matrix, plus a few columns of its own: the arc's CLR, its ovality, the tube's radius, where it is asked
+//! for the arc's flattening, and on ramps that are told apart what the arc's angle does to them. The sum of their outer
+//! products per segment is all of the points that the normal equations need: a pass costs O(points) whatever the number
+//! of bends.
 //!
 //! Sums run over chunks of fixed size and are added in order: the result does not depend on the threads.
 
@@ -26,8 +27,7 @@ const ON_SURFACE: f64 = 0.1;
 /// Derivatives of a residual: six Plücker coordinates (negated), own CLR, own ovality, tube radius.
 pub const ROWS: usize = 9;
 
-/// Places of the other derivatives and of the residual in a moment. The flattening comes last: only the last fit may ask
-/// for it.
+/// Places of the other derivatives and of the residual in a moment. Those behind the residual only some fits ask for.
 pub const OWN_RADIUS: usize = 6;
 /// See [`OWN_RADIUS`].
 pub const OVALITY: usize = 7;

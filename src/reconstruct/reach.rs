@@ -253,4 +253,18 @@ mod tests {
         assert!((85.0..100.0).contains(&high), "{high}");
         assert!(on.iter().all(|p| p.y.hypot(p.z) < 0.1));
     }
+
+    #[test]
+    fn an_end_behind_which_more_was_scanned_is_told() {
+        let straight: Vec<Point3<f64>> = (0..20).map(|i| Point3::new(3.0 * f64::from(i), 0.0, 0.0)).collect();
+        let ends_after = |gap_mm: f64| {
+            let mut seen = points(&tube(500.0, 80.0), 200.0, 260.0);
+            seen.extend(points(&tube(500.0, 80.0), 260.0 + gap_mm, 270.0 + gap_mm));
+            seen.iter_mut().for_each(|p| p.x += 300.0);
+            drawn_on(straight.clone(), 3.0, RADIUS, &PointCloud::from_points(&seen)).1
+        };
+        let hidden = ends_after(15.0);
+        assert!(hidden.len() == 1 && (50.0..65.0).contains(&hidden[0].x), "{hidden:?}");
+        assert!(ends_after(40.0).is_empty(), "so far away it is something else");
+    }
 }

@@ -38,10 +38,10 @@ const ARC_FACTOR: f64 = 2.5;
 /// Candidates whose scores differ by less are one: about what a fit leaves unresolved.
 const SAME_SCORE: f64 = 0.01;
 
-/// Where a tube strays farther from the polygon, in radii, the points of its sections do not lie on one section; and still
-/// farther it has lost its way: the sections there are measured as if nothing had been fitted.
+/// Where a tube strays farther from the polygon, in radii, the points of its sections do not lie on one section.
 const STRAYED_RADII: f64 = 0.03;
 
+/// A tube that strays so far has lost its way: its sections are measured as if nothing had been fitted.
 const LOST_RADII: f64 = 0.2;
 
 /// Bend radii of one tube are expected within this share of each other.
