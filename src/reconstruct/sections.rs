@@ -76,6 +76,8 @@ pub struct CentreLine {
     pub count: f64,
     /// Where sections were left out because something else was scanned there.
     crowded: Crowded,
+    /// Longest stretch between two sections where all were left out.
+    silence_mm: f64,
 }
 
 /// A point as its section sees it.
@@ -118,7 +120,7 @@ impl CentreLine {
         let sections: Vec<Section> = (0..polygon.len()).map(section).collect();
         let count = sections.len() as f64;
         let crowded = Crowded::default();
-        CentreLine { sections, radius_mm, noise_mm: 0.01 * radius_mm, count, crowded }
+        CentreLine { sections, radius_mm, noise_mm: 0.01 * radius_mm, count, crowded, silence_mm: 0.0 }
     }
 
     /// Measures the sections of a tube that lies near `base`: one that the polygon gave, or one that was fitted.
@@ -154,6 +156,7 @@ impl CentreLine {
         let among = |i: usize| alone[i.saturating_sub(1)..(i + 2).min(alone.len())].iter().all(|a| *a);
         let nowhere_else = Values::zeros();
         let (mut sections, mut places) = (Vec::new(), Vec::new());
+        let (mut heard_mm, mut is_silent, mut silence_mm) = (f64::INFINITY, false, 0.0_f64);
         for (i, ((place, seen), fit)) in bins.places().zip(&grouped).zip(&fits).enumerate() {
             // So few points lie on some section or other, a flying one among them too: that of the base tells which.
             let few = fitted && (seen.len() as f64) < JUDGED_POINTS;
@@ -175,8 +178,13 @@ impl CentreLine {
             };
             if fitted && silent() {
                 places.push(frame.translation.vector.into());
+                is_silent = true;
                 continue;
             }
+            if std::mem::take(&mut is_silent) {
+                silence_mm = silence_mm.max(at_mm - heard_mm);
+            }
+            heard_mm = at_mm;
             let across = [frame.rotation * Vector3::y(), frame.rotation * Vector3::z()];
             let oval_mm = [locals[place].uneven_mm(along, base.tube_radius_mm).0, 0.0];
             doubt_ovality(&mut sums, noise / oval_doubt_mm(base, &spine, at_mm));
@@ -198,12 +206,24 @@ impl CentreLine {
         }
         let count = sections.iter().map(|s| s.count).sum();
         let crowded = Crowded { places, reach_mm: base.tube_radius_mm.hypot(0.5 * bins.length_mm) };
-        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded }
+        CentreLine { sections, radius_mm: base.tube_radius_mm, noise_mm: noise, count, crowded, silence_mm }
     }
 
     /// Where it tells nothing because something else was scanned there.
     pub fn crowded(&self) -> &Crowded {
         &self.crowded
+    }
+
+    /// The longest stretch of the tube, ends aside, where sections were left out.
+    pub fn silence_mm(&self) -> f64 {
+        self.silence_mm
+    }
+
+    /// Sum of the points' squared residuals about a model.
+    pub fn cost(&self, model: &TubeModel) -> f64 {
+        let mut sum = 0.0;
+        self.walk(model, |section, _, values, _| sum += cost(&section.sums, values));
+        sum
     }
 
     /// The farthest that two tubes lie apart across the centre line.

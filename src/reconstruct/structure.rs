@@ -44,6 +44,11 @@ const STRAYED_RADII: f64 = 0.03;
 /// A tube that strays so far has lost its way: its sections are measured as if nothing had been fitted.
 const LOST_RADII: f64 = 0.2;
 
+/// Of a stretch this long that was left out, in radii, it is asked whether the tube is wrong there: whether its points miss the
+/// tube by this many times their noise, squared. Beside tables, jaws and other legs it is 0 to 8, with bends that are missing 60.
+const SILENT_RADII: f64 = 4.0;
+const LOUD: f64 = 10.0;
+
 /// Bend radii of one tube are expected within this share of each other.
 const RADIUS_SPREAD: f64 = 0.3;
 
@@ -141,11 +146,14 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     jury.prior = radius_prior(&clearest.model);
     jury.correlation = jury.line.correlation(&clearest.model);
     let mut best = jury.judge(clearest.model.clone());
-    for _ in 0..MEASUREMENTS {
+    for round in 0..MEASUREMENTS {
         best.model = reaching(&best.model, sample);
         // Far from its polygon a tube's sections would take its own points for strangers'.
         let strays = way.farthest_mm(&best.model) > LOST_RADII * radius_mm;
         jury.line = CentreLine::measure(sample, &best.model, !strays);
+        if round == 0 {
+            jury.listen(sample, &best.model);
+        }
         best = jury.fit(&best.model, FULL_STEPS, f64::INFINITY);
         jury.correlation = jury.line.correlation(&best.model);
         best = jury.judge(best.model);
@@ -219,6 +227,20 @@ impl Jury {
             format!("the bends between {from_mm:.0} and {to_mm:.0} mm, which lead nowhere, pulled straight");
         self.decide(what, None, before - score, true);
         Some(self.judge(fit.model))
+    }
+
+    /// Lets all sections speak where a long row of them was left out that speaks loudly against the tube: then a bend that is
+    /// missing makes the tube's own points look like strangers'.
+    fn listen(&mut self, sample: &[Point3<f64>], model: &TubeModel) {
+        if self.line.silence_mm() < SILENT_RADII * model.tube_radius_mm {
+            return;
+        }
+        let all = CentreLine::measure(sample, model, false);
+        let chi2 = |line: &CentreLine| line.cost(model) / line.noise_mm.powi(2) / self.correlation;
+        let left_out = all.count - self.line.count;
+        if chi2(&all) - chi2(&self.line) > LOUD * left_out {
+            self.line = all;
+        }
     }
 
     /// Bends that know their own CLR.
