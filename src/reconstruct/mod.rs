@@ -49,6 +49,7 @@ mod search;
 mod search_tests;
 mod section;
 mod sections;
+mod seen;
 pub mod simplify;
 mod square;
 mod strangers;

@@ -22,7 +22,7 @@ use super::fit::CUTOFF_SIGMAS;
 use super::local::{Local, prepare};
 use super::model::TubeModel;
 use super::section::{Bins, oval_doubt_mm};
-use super::sections::FIRST_CUTOFF;
+use super::seen::FIRST_CUTOFF;
 use super::strangers::Crowded;
 use super::stripes;
 use super::structure::Structure;

@@ -6,31 +6,28 @@
 //! hundred times cheaper, and nothing is lost that a small change of the tube could show (the sums are sufficient
 //! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
 
-use nalgebra::{Cholesky, Matrix2, Matrix5, Point3, SMatrix, Vector2, Vector3, Vector5};
+use nalgebra::{Matrix5, Point3, SMatrix, Vector3};
 use rayon::prelude::*;
 
 use super::fit::Data;
-use super::local::{Local, Outline, prepare, settle};
+use super::local::{Local, prepare, settle};
 use super::model::TubeModel;
 use super::moments::{Moment, OVALITY, OWN_RADIUS, Pass, RESIDUAL, ROWS, TUBE_RADIUS};
 use super::section::{
     Bins, JUDGED_POINTS, MEDIAN_CHI2, SPREADS, Sums, VALUES, Values, cost, doubt_ovality, oval_doubt_mm,
     solve,
 };
+use super::seen::{FIRMNESS, FIRST_CUTOFF, group, middle_mm, offs, scatter, see, straighten, sums};
 use super::strangers::{Crowded, Strangers, beset, is_at_an_end, is_oval_untold};
-use crate::recognize::{MEDIAN_TO_SIGMA, median};
+use crate::recognize::median;
 use crate::tube::{Spine, any_normal};
 
 /// The same about a base that has been fitted, radius and ovality and all.
 const FITTED_SPREADS: [f64; VALUES] = [0.002, 0.3, 0.3, 0.004, 0.004];
 
-/// Points farther than this from the base tube do not count, in tube radii.
-pub const FIRST_CUTOFF: f64 = 0.4;
 /// Rounds in which the cut-off comes down to the noise, no faster than by this factor.
 const SHRINKS: usize = 6;
 const SHRINK: f64 = 0.4;
-/// Noise over cut-off that is pretended while points are weighed.
-const FIRMNESS: f64 = 1.0;
 /// So far from an end, in tube radii, burr, bore and face may reach; a section there that misses the tube's shape so many
 /// times more than is usual has some of them; and what its radius and ovality may be off at most, in tube radii.
 const DAMAGED_RADII: f64 = 2.0;
@@ -39,14 +36,8 @@ const TUBES_OWN: f64 = 1e-4;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
 
-/// How steeply the tube may lean against the base tube.
-const STEEPEST: f64 = 0.2;
-
 /// Neighbouring sections are taken to follow each other no more than this.
 const MOST_FOLLOWING: f64 = 0.9;
-
-/// Points that a thread looks at in one go.
-const SEEN_TOGETHER: usize = 512;
 
 /// One short stretch of the tube.
 #[derive(Debug, Clone)]
@@ -78,24 +69,6 @@ pub struct CentreLine {
     crowded: Crowded,
     /// Longest stretch between two sections where all were left out.
     silence_mm: f64,
-}
-
-/// A point as its section sees it.
-#[derive(Debug, Clone, Copy)]
-struct Seen {
-    section: u32,
-    along_mm: f64,
-    cos: f64,
-    sin: f64,
-    residual_mm: f64,
-}
-
-impl Seen {
-    /// Derivatives of the section's values.
-    fn row(&self) -> Vector5<f64> {
-        let (c, s) = (self.cos, self.sin);
-        Vector5::new(1.0, c, s, c * c - s * s, 2.0 * s * c)
-    }
 }
 
 impl CentreLine {
@@ -165,7 +138,7 @@ impl CentreLine {
             if count < 1.0 {
                 continue;
             }
-            let along = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len() as f64;
+            let along = middle_mm(seen);
             let segment = &spine.segments()[place];
             let frame = segment.frame_at(along);
             // Before the first fit the radius is a guess: all points may look like strangers.
@@ -404,47 +377,6 @@ fn add_moment(
     cost
 }
 
-/// Sums of a section's points, weighted by the biweight about its own fit.
-fn sums(seen: &[Seen], fit: &Values, cutoff_mm: f64) -> Sums {
-    // Both triangles: more products, but in rows that the compiler turns into vector instructions.
-    let mut sums = [[0.0; VALUES + 1]; VALUES + 1];
-    for point in seen {
-        let row = point.row();
-        let t = (point.residual_mm - row.dot(fit)) / cutoff_mm;
-        let keep = 1.0 - t * t;
-        if keep > 0.0 {
-            let h = [row[0], row[1], row[2], row[3], row[4], point.residual_mm];
-            let weighted = h.map(|v| keep * keep * v);
-            for (sums, weighted) in sums.iter_mut().zip(weighted) {
-                for (sum, value) in sums.iter_mut().zip(h) {
-                    *sum += weighted * value;
-                }
-            }
-        }
-    }
-    Sums::from(sums)
-}
-
-/// Takes out of a section's residuals by how much the tube leans against the base tube there: where a bend is missing its points
-/// would else not lie on one section.
-fn straighten(seen: &mut [Seen], fit: &Values, cutoff_mm: f64, radius_mm: f64) {
-    let middle_mm = seen.iter().map(|s| s.along_mm).sum::<f64>() / seen.len().max(1) as f64;
-    let row = |s: &Seen| Vector2::new(s.cos, s.sin) * ((s.along_mm - middle_mm) / radius_mm);
-    let stiffness = (FIRMNESS * cutoff_mm / (STEEPEST * radius_mm)).powi(2);
-    let (mut square, mut right) = (Matrix2::identity() * stiffness, Vector2::zeros());
-    for point in seen.iter() {
-        let off = point.residual_mm - point.row().dot(fit);
-        let keep = 1.0 - (off / cutoff_mm).powi(2);
-        if keep > 0.0 {
-            let row = row(point);
-            square += row * row.transpose() * (keep * keep);
-            right += row * (keep * keep * off);
-        }
-    }
-    let slopes = Cholesky::new(square).map_or(Vector2::zeros(), |c| c.solve(&right));
-    seen.iter_mut().for_each(|s| s.residual_mm -= row(s).dot(&slopes));
-}
-
 /// Whether burr, bore and face may reach a place.
 fn may_be_damaged(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
     at_mm.min(spine.length_mm() - at_mm) <= DAMAGED_RADII * base.tube_radius_mm
@@ -468,64 +400,4 @@ fn damaged_ends(
         may_be_damaged(base, spine, at_mm) && misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2)
     };
     sections.into_iter().partition(is_damaged)
-}
-
-/// By how much points lie outside a section's fit.
-fn offs(seen: &[Seen], fit: &Values) -> impl Iterator<Item = f64> + Clone {
-    seen.iter().map(move |s| s.residual_mm - s.row().dot(fit))
-}
-
-/// Robust standard deviation of the points about their sections' fits.
-fn scatter(grouped: &[Vec<Seen>], fits: &[Values], cutoff_mm: f64) -> f64 {
-    let mut sizes = Vec::new();
-    let mut spent = 0.0;
-    for (seen, fit) in grouped.iter().zip(fits) {
-        let before = sizes.len();
-        sizes.extend(offs(seen, fit).map(f64::abs).filter(|r| *r < cutoff_mm));
-        spent += ((sizes.len() - before) as f64 * 0.5).min(VALUES as f64);
-    }
-    let n = sizes.len() as f64;
-    let freedom = (n / (n - spent).max(1.0)).sqrt();
-    median(&mut sizes).unwrap_or(cutoff_mm) * MEDIAN_TO_SIGMA * freedom
-}
-
-/// All points near the base tube.
-fn see(points: &[Point3<f64>], base: &TubeModel, locals: &[Local], bins: &Bins) -> Vec<Seen> {
-    let spine = base.spine();
-    let cutoff = FIRST_CUTOFF * base.tube_radius_mm;
-    let part = |points: &[Point3<f64>]| {
-        let mut segment = 0;
-        let one = |p: &Point3<f64>| {
-            let mut local = settle(p, &mut segment, locals);
-            let mut off = locals[segment as usize].off_axis(&local);
-            if (off.norm() - base.tube_radius_mm).abs() > cutoff {
-                // The point before may have been on another leg.
-                segment = spine.closest(p).segment as u32;
-                local = settle(p, &mut segment, locals);
-                off = locals[segment as usize].off_axis(&local);
-            }
-            let distance = off.norm();
-            if (distance - base.tube_radius_mm).abs() >= cutoff {
-                return None;
-            }
-            let k = segment as usize;
-            let along_mm = locals[k].unclamped_along_mm(&local);
-            let (cos, sin) = (off.x / distance, off.y / distance);
-            let (oval_mm, flat_mm) = locals[k].uneven_mm(along_mm, base.tube_radius_mm);
-            // From the outside of the bend, which is the other way.
-            let outline = Outline::at(-cos, sin, base.tube_radius_mm, oval_mm, flat_mm);
-            let residual_mm = distance - outline.radius_mm;
-            let section = bins.of(k, along_mm / locals[k].length_mm.max(1e-12)) as u32;
-            Some(Seen { section, along_mm, cos, sin, residual_mm })
-        };
-        points.iter().filter_map(one).collect::<Vec<Seen>>()
-    };
-    points.par_chunks(SEEN_TOGETHER).map(part).collect::<Vec<_>>().concat()
-}
-
-/// Points by their section.
-fn group(seen: Vec<Seen>, sections: usize) -> Vec<Vec<Seen>> {
-    let mut out = vec![Vec::new(); sections];
-    seen.into_iter().for_each(|s| out[s.section as usize].push(s));
-    out
 }
