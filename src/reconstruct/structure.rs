@@ -146,6 +146,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     jury.prior = radius_prior(&clearest.model);
     jury.correlation = jury.line.correlation(&clearest.model);
     let mut best = jury.judge(clearest.model.clone());
+    let mut unsettled = None;
     for round in 0..MEASUREMENTS {
         best.model = reaching(&best.model, sample);
         // Far from its polygon a tube's sections would take its own points for strangers'.
@@ -164,12 +165,17 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
             continue;
         }
         // The search may have learned how many points say one thing: what was before is judged by that, too.
-        if best.bends() == before.bends() && best.score >= jury.judge(before.model).score {
+        let settled = best.bends() == before.bends() && best.score >= jury.judge(before.model.clone()).score;
+        unsettled = (best.bends() != before.bends()).then_some(before.model);
+        if settled {
             break;
         }
     }
     if jury.knowing_their_radius(&best) > 1 {
         best = jury.common(best);
+    }
+    if let Some(other) = unsettled.filter(|o| o.lra.bends.len() != best.bends()) {
+        best = jury.settled(sample, best, other);
     }
     best = jury.united(best);
     let passes_mm = stripes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
@@ -227,6 +233,29 @@ impl Jury {
             format!("the bends between {from_mm:.0} and {to_mm:.0} mm, which lead nowhere, pulled straight");
         self.decide(what, None, before - score, true);
         Some(self.judge(fit.model))
+    }
+
+    /// Of two tubes with different numbers of bends that each find the other better, by the sections taken about them, the one
+    /// that the points do, with one CLR for all bends or without.
+    fn settled(&mut self, sample: &[Point3<f64>], best: Candidate, other: TubeModel) -> Candidate {
+        let mut points = Sample::new(sample.to_vec(), &best.model);
+        let mut fit = |model: &TubeModel| {
+            let fits = [
+                self.fit_points(&mut points, model),
+                self.fit_points(&mut points, &with_common_radius(model)),
+            ];
+            let [own, common] = fits;
+            if common.1 < own.1 { common } else { own }
+        };
+        let (before, now) = (fit(&best.model), fit(&other));
+        let gain = before.1 - now.1;
+        if gain <= 0.0 {
+            return best;
+        }
+        let what = format!("{} bends rather than {}, by the points", other.lra.bends.len(), best.bends());
+        self.decide(what, None, gain, true);
+        self.line = CentreLine::measure(sample, &now.0.model, true);
+        self.judge(now.0.model)
     }
 
     /// Lets all sections speak where a long row of them was left out that speaks loudly against the tube: then a bend that is
