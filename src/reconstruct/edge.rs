@@ -5,7 +5,9 @@
 //! pattern. How close in this pattern, the pattern itself is asked: the same points are cut at known places further
 //! inside, the same plane is pushed there, and its mean error is the correction, its scatter the covariance.
 
-use nalgebra::{Matrix3, Vector3};
+use std::ops::Range;
+
+use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::square::{Estimate, SAW_SPREAD};
 
@@ -29,6 +31,9 @@ const BURR_TIMES: f64 = 2.0;
 const ROUNDS: usize = 15;
 /// Fewest points per step along the tube.
 const FEWEST_PER_STEP: f64 = 6.0;
+
+/// All of the tube that was scanned.
+const EVERYWHERE: Range<f64> = f64::NEG_INFINITY..f64::INFINITY;
 
 /// A point of the outside: along the tube (past a slope), y, z.
 pub type Along = [f64; 3];
@@ -77,9 +82,10 @@ impl Edge {
         Some(Edge { points, step_mm, radius_mm, pattern })
     }
 
-    /// The points up to `to_mm` past another slope besides.
-    fn sloped(&self, slope: &Vector3<f64>, to_mm: f64) -> Edge {
-        let near = &self.points[..self.points.partition_point(|p| p[0] < to_mm)];
+    /// The points within a range along the tube, past another slope besides.
+    fn sloped(&self, slope: &Vector3<f64>, within_mm: Range<f64>) -> Edge {
+        let at = |place: f64| self.points.partition_point(|p| p[0] < place);
+        let near = &self.points[at(within_mm.start)..at(within_mm.end)];
         let turned = |p: &Along| [p[0] - slope.y * p[1] - slope.z * p[2], p[1], p[2]];
         let mut points: Vec<Along> = near.iter().map(turned).collect();
         points.sort_unstable_by(|a, b| a[0].total_cmp(&b[0]));
@@ -88,17 +94,32 @@ impl Edge {
 
     /// The edge wherever the points say, close to a slope.
     pub fn free(&self, near: [f64; 2]) -> Option<Estimate> {
-        let mut slope = Vector3::new(0.0, near[0], near[1]);
-        // At 45 degrees it begins and ends a radius from where it meets the axis.
-        let near_mm = self.points.first()?[0] + 2.0 * self.radius_mm + DEPTH_STEPS * self.step_mm;
-        // Coarsely first: a plane is only drawn to points that are near it.
-        for soft in [0.5 * self.step_mm, 0.2 * self.step_mm, 0.0, 0.0] {
-            let value = self.sloped(&slope, near_mm).push(f64::NEG_INFINITY, true, soft)?;
-            slope += Vector3::new(0.0, value.y, value.z);
-        }
-        let mut found = self.sloped(&slope, f64::INFINITY).estimate(true)?;
+        let slope = self.slope(f64::NEG_INFINITY, near)?;
+        let mut found = self.sloped(&slope, EVERYWHERE).estimate(true)?;
         found.value += slope;
         Some(found)
+    }
+
+    /// The slope to which the points from `from` on draw a plane that is close to it.
+    fn slope(&self, from: f64, near: [f64; 2]) -> Option<Vector3<f64>> {
+        let mut slope = Vector3::new(0.0, near[0], near[1]);
+        let first_mm = self.points.iter().find(|p| p[0] >= from)?[0];
+        // At 45 degrees it begins and ends a radius from where it meets the axis.
+        let near_mm = first_mm + 2.0 * self.radius_mm + DEPTH_STEPS * self.step_mm;
+        // Coarsely first: a plane is only drawn to points that are near it.
+        for soft in [0.5 * self.step_mm, 0.2 * self.step_mm, 0.0, 0.0] {
+            let value = self.sloped(&slope, from..near_mm).push(f64::NEG_INFINITY, true, soft)?;
+            slope += Vector3::new(0.0, value.y, value.z);
+        }
+        Some(slope)
+    }
+
+    /// The slopes that square cuts at known places would be found with, sought close to this one: where stripes lie nearly along
+    /// it some are drawn to theirs.
+    pub fn lured(&self, near: [f64; 2]) -> Vec<Vector2<f64>> {
+        let begin = self.push(f64::NEG_INFINITY, false, 0.0).map(|v| v.x);
+        let cuts = begin.and_then(|begin_mm| self.cuts(begin_mm)).into_iter().flatten();
+        cuts.filter_map(|cut| self.slope(cut, near)).map(|s| s.yz()).collect()
     }
 
     /// The edge of a square cut.

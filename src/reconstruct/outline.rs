@@ -7,7 +7,7 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::edge::Edge;
-use super::square::{self, Estimate, Weighed};
+use super::square::{self, Estimate, Lure, Weighed};
 use crate::recognize::{MEDIAN_TO_SIGMA, median};
 
 /// Sectors around the tube: not narrower than this many steps of the pattern.
@@ -36,6 +36,8 @@ const SECTOR_STEPS_SIGMA: f64 = 0.4;
 const AGREE_STEPS: f64 = 2.0;
 /// What is left of an end beside a burr is square within so many standard deviations of its slope.
 const SQUARE_SIGMAS: f64 = 2.0;
+/// An edge that is less likely square is held against what square ones look like in the pattern, one by one.
+const CLEARLY_SQUARE: f64 = 0.9;
 /// Sectors of less weight do not stop at the plane.
 const LEAST_WEIGHT: f64 = 0.5;
 
@@ -282,7 +284,13 @@ impl Rough {
         let scatter = edge.filter(|_| by_points.is_some()).and_then(Edge::scatter);
         let scatter = scatter.unwrap_or(free.variance) + passes;
         let [free, square] = [free, square].map(|e| Estimate { variance: e.variance + passes, ..e });
-        Fine { free, both: square::weigh(&free, &square, &scatter) }
+        let mut lure = Lure { scatter, slopes: Vec::new() };
+        let both = square::weigh(&free, &square, &lure);
+        if by_points.is_none() || both.square_share > CLEARLY_SQUARE {
+            return Fine { free, both };
+        }
+        lure.slopes = edge.map_or_else(Vec::new, |e| e.lured(self.slope()));
+        Fine { free, both: square::weigh(&free, &square, &lure) }
     }
 
     fn slope(&self) -> [f64; 2] {

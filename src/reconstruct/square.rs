@@ -35,13 +35,37 @@ pub struct Weighed {
     pub square_share: f64,
 }
 
-/// Weighs a plane that was estimated freely against one that was expected to be square. `scatter` is the covariance with
-/// which an edge is estimated freely that is square: stripes that lie nearly along it draw the plane to themselves.
-pub fn weigh(free: &Estimate, square: &Estimate, scatter: &Matrix3<f64>) -> Weighed {
+/// How a square edge is estimated freely in the pattern of the scan: stripes that lie nearly along it draw the plane to
+/// themselves.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lure {
+    /// The covariance of such estimates.
+    pub scatter: Matrix3<f64>,
+    /// Slopes of some of them: most lie close to square, a few on the stripes' slope.
+    pub slopes: Vec<Vector2<f64>>,
+}
+
+impl Lure {
+    /// The likelihood of a slope if the cut is square: as normally distributed, or near one of the slopes.
+    fn log_likelihood(&self, free: &Estimate) -> f64 {
+        let smooth = log_likelihood(&Estimate { variance: self.scatter, ..*free }, SAW_SPREAD);
+        if self.slopes.is_empty() {
+            return smooth;
+        }
+        let near = |slope: &Vector2<f64>| {
+            let off = Vector3::new(0.0, slope.x, slope.y);
+            log_likelihood(&Estimate { value: free.value - off, ..*free }, SAW_SPREAD).exp()
+        };
+        let lured = self.slopes.iter().map(near).sum::<f64>() / self.slopes.len() as f64;
+        (0.5 * (smooth.exp() + lured)).max(f64::MIN_POSITIVE).ln()
+    }
+}
+
+/// Weighs a plane that was estimated freely against one that was expected to be square.
+pub fn weigh(free: &Estimate, square: &Estimate, lure: &Lure) -> Weighed {
     let mitred = expected(free, MITRE_SPREAD);
-    let if_square = log_likelihood(&Estimate { variance: *scatter, ..*free }, SAW_SPREAD);
-    let log_odds =
-        if_square - log_likelihood(free, MITRE_SPREAD) + (SQUARE_SHARE / (1.0 - SQUARE_SHARE)).ln();
+    let log_odds = lure.log_likelihood(free) - log_likelihood(free, MITRE_SPREAD)
+        + (SQUARE_SHARE / (1.0 - SQUARE_SHARE)).ln();
     let share = 1.0 / (1.0 + (-log_odds).exp());
     let apart = square.value - mitred.value;
     let estimate = Estimate {
@@ -120,7 +144,7 @@ mod tests {
     }
 
     fn weighed(free: Estimate, square: Estimate) -> Weighed {
-        weigh(&free, &square, &free.variance)
+        weigh(&free, &square, &Lure { scatter: free.variance, slopes: Vec::new() })
     }
 
     #[test]
@@ -152,7 +176,18 @@ mod tests {
         let (free, square) = (plane(5.3, 0.06, [0.3, 0.01]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
         assert!(weighed(free, square).square_share < 0.1);
         let scatter = Matrix3::from_diagonal(&Vector3::new(0.1, 2e-3, 2e-3));
-        assert!(weigh(&free, &square, &scatter).square_share > 0.7);
+        let lure = Lure { scatter, slopes: Vec::new() };
+        assert!(weigh(&free, &square, &lure).square_share > 0.7);
+    }
+
+    #[test]
+    fn a_slope_that_one_square_edge_in_fifty_shows_is_likelier_than_a_steep_mitre() {
+        let (free, square) = (plane(5.3, 0.2, [0.3, 0.015]), plane(5.0, 0.0, [0.05, SAW_SPREAD]));
+        let scatter = Matrix3::from_diagonal(&Vector3::new(0.1, 1e-3, 1e-3));
+        let mut lure = Lure { scatter, slopes: vec![Vector2::new(0.01, -0.02); 49] };
+        assert!(weigh(&free, &square, &lure).square_share < 0.1);
+        lure.slopes.push(Vector2::new(0.18, 0.01));
+        assert!(weigh(&free, &square, &lure).square_share > 0.9);
     }
 
     #[test]
