@@ -19,6 +19,19 @@ pub enum ReconstructError {
         /// Usual distance of the points looked at.
         spacing_mm: f64,
     },
+    /// A tube's surface, of which too little was seen.
+    #[error(
+        "only {seen_mm:.0} mm of a tube of radius {radius_mm:.2} mm are seen in one piece, where {wanted_mm:.0} are needed; scan \
+        more of it, clear of what holds or hides it"
+    )]
+    TooShort {
+        /// Length of the longest piece of its centre line.
+        seen_mm: f64,
+        /// Radius of the tube.
+        radius_mm: f64,
+        /// Length that would do.
+        wanted_mm: f64,
+    },
     /// The points on the surface are too few or too scattered.
     #[error(
         "the tube's centre line cannot be found: only {found} of {points} points lie on a tube of radius {radius_mm:.2} mm; scan more densely (a point per {wanted_mm:.2} mm or closer)"

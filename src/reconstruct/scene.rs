@@ -94,22 +94,20 @@ pub fn look(cloud: &PointCloud, nominal: Option<&Nominal>) -> Result<Scene, Reco
     let best = candidates.first().ok_or_else(no_tube)?.support;
     let exact_mm = EXACT * candidates.iter().map(|c| c.rms_mm).fold(f64::INFINITY, f64::min);
     let mut tubes: Vec<Tube> = Vec::new();
-    let mut sparse = None;
+    let mut reason = None;
     for candidate in candidates.iter().take(CANDIDATES).filter(|c| c.support >= LEAST_OF_BEST * best) {
         let radius_mm = candidate.radius_mm;
         let work = at_radius(cloud, &rest, &faces, candidate);
         let spine = mls::spine_cloud(&work, radius_mm);
-        let found = tubes_of(&work, &spine, radius_mm);
-        let coarse = rest.spacing_mm > COARSEST_RADII * radius_mm && candidate.support > SURE_SUPPORT;
-        if found.is_empty() && sparse.is_none() && coarse {
-            let (found, wanted_mm) = (spine.len(), COARSEST_RADII * radius_mm);
-            let points = work.len();
-            sparse = Some(ReconstructError::TooSparse { found, points, radius_mm, wanted_mm });
+        let chains = chains(&spine, radius_mm);
+        let found = tubes_of(&work, &chains, radius_mm);
+        if found.is_empty() && candidate.support > SURE_SUPPORT {
+            reason = reason.or_else(|| too_little(&work, &spine, &chains, rest.spacing_mm, radius_mm));
         }
         found.into_iter().for_each(|t| keep_apart(&mut tubes, t, &rest.cloud, exact_mm));
     }
     if tubes.is_empty() {
-        return Err(sparse.unwrap_or_else(no_tube));
+        return Err(reason.unwrap_or_else(no_tube));
     }
     let (tube, warnings) = choose(tubes, nominal)?;
     if tube.closed {
@@ -153,23 +151,53 @@ fn at_radius(cloud: &PointCloud, rest: &Moderate, faces: &[Face], candidate: &Ca
     if coarse { off_faces(cloud, faces).thinned(cell) } else { rest.cloud.thinned(cell) }
 }
 
-/// The tubes of one radius, the longest first.
-fn tubes_of(work: &PointCloud, spine: &[SpinePoint], radius_mm: f64) -> Vec<Tube> {
+/// Centre lines of one radius, the longest first.
+fn chains(spine: &[SpinePoint], radius_mm: f64) -> Vec<Vec<Point3<f64>>> {
     let spacing = SPINE_SPACING_RADII * radius_mm;
-    crust::connect(&mls::condense(spine, spacing), spacing, radius_mm)
-        .into_iter()
-        .map(|chain| crust::trimmed(chain, spacing, radius_mm))
+    let chains = crust::connect(&mls::condense(spine, spacing), spacing, radius_mm);
+    chains.into_iter().map(|chain| crust::trimmed(chain, spacing, radius_mm)).collect()
+}
+
+/// What is missing where a radius is sure and no tube was found with it.
+fn too_little(
+    work: &PointCloud,
+    spine: &[SpinePoint],
+    chains: &[Vec<Point3<f64>>],
+    spacing_mm: f64,
+    radius_mm: f64,
+) -> Option<ReconstructError> {
+    let wanted_mm = COARSEST_RADII * radius_mm;
+    if spacing_mm > wanted_mm {
+        let (found, points) = (spine.len(), work.len());
+        return Some(ReconstructError::TooSparse { found, points, radius_mm, wanted_mm });
+    }
+    let lengths_mm = chains.iter().map(|c| crust::solid_length_mm(c, SPINE_SPACING_RADII * radius_mm));
+    let seen_mm = lengths_mm.fold(0.0, f64::max);
+    let wanted_mm = LEAST_LENGTH_RADII * radius_mm;
+    // Less than a radius is any curved corner.
+    (radius_mm..wanted_mm).contains(&seen_mm).then_some(ReconstructError::TooShort {
+        seen_mm,
+        radius_mm,
+        wanted_mm,
+    })
+}
+
+/// The tubes that have these centre lines.
+fn tubes_of(work: &PointCloud, chains: &[Vec<Point3<f64>>], radius_mm: f64) -> Vec<Tube> {
+    let spacing = SPINE_SPACING_RADII * radius_mm;
+    chains
+        .iter()
         .filter(|c| crust::solid_length_mm(c, spacing) >= LEAST_LENGTH_RADII * radius_mm)
         .filter_map(|polygon| {
-            let around = Surroundings::new(&polygon, radius_mm);
+            let around = Surroundings::new(polygon, radius_mm);
             let on = on_surface(&around, radius_mm, work)?;
             Some(Tube {
                 radius_mm,
                 around,
-                solid_mm: crust::solid_length_mm(&polygon, spacing),
+                solid_mm: crust::solid_length_mm(polygon, spacing),
                 area_mm2: on as f64 * (WORK_CELL_RADII * radius_mm).powi(2),
-                closed: crust::is_closed(&polygon, spacing, radius_mm),
-                polygon,
+                closed: crust::is_closed(polygon, spacing, radius_mm),
+                polygon: polygon.clone(),
             })
         })
         .collect()
