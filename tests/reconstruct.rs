@@ -227,6 +227,23 @@ fn a_tube_that_once_lost_its_way() {
     expect_right(Set::Thirty, &[76213]);
 }
 
+/// A bend that was missing made its own points look like strangers' (83079), two numbers of bends that each found the other better
+/// (84253), and a stripe of points that passed for a mitre (83190).
+#[test]
+fn choices_that_once_went_wrong() {
+    expect_right(Set::Thirty, &[83079, 83190, 84253]);
+}
+
+/// 30 mm of a tube 22 mm thick are seen, in two pieces; the jaw hides the rest.
+#[test]
+fn too_short_a_piece_is_refused_with_what_was_seen() {
+    let folder = TempDir::new().unwrap();
+    let case = run_case(Set::Hard, 83004, Known::Nothing, folder.path()).unwrap();
+    let verdict = case.judgement.verdict;
+    let says = |why: &String| why.contains("20 mm of a tube of radius 11.17 mm are seen in one piece");
+    assert!(matches!(&verdict, Verdict::Refused(why) if says(why)), "{verdict:?}");
+}
+
 fn expect_right(set: Set, seeds: &[u64]) {
     let folder = TempDir::new().unwrap();
     for &seed in seeds {
