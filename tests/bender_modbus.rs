@@ -8,7 +8,7 @@ use benderd::bender::{
     Bender, Intent, IntentLog, Job, LinkError, LogError, ModbusLink, Outcome, Profile, WordOrder, deliver,
 };
 use benderd::sim::bender::MachineModel;
-use benderd::sim::bender_server::{Fault, SimulatedBender};
+use benderd::sim::bender_server::{Door, Fault, SimulatedBender};
 use benderd::tube::{CommandRow, CommandTable};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -53,7 +53,7 @@ fn job(bends: usize) -> Job {
 async fn bender(profile: &Profile, bends: u16, fault: Option<Fault>) -> SimulatedBender {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let model = MachineModel::new(profile.clone(), "P1", bends);
-    SimulatedBender::start(listener, model, fault, |_| ()).unwrap()
+    SimulatedBender::start(Door::Tcp(listener), model, fault, |_| ()).unwrap()
 }
 
 fn link(profile: Profile, to: &SimulatedBender) -> ModbusLink {

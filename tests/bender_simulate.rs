@@ -42,7 +42,13 @@ fn push_goes_on_when_nobody_reads_what_it_says() {
     let model = benderd::sim::bender::MachineModel::new(profile, "p1", 1);
     let bender = runtime.block_on(async {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        benderd::sim::bender_server::SimulatedBender::start(listener, model, None, |_| ()).unwrap()
+        benderd::sim::bender_server::SimulatedBender::start(
+            benderd::sim::bender_server::Door::Tcp(listener),
+            model,
+            None,
+            |_| (),
+        )
+        .unwrap()
     });
     let folder = tempfile::tempdir().unwrap();
     let table = folder.path().join("p1.csv");

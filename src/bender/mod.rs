@@ -10,26 +10,36 @@
 //! delivery  stage, verify, commit: events and time in, one action out
 //! driver    performs the actions on a link and a journal
 //! contact   when a link connects, asks, keeps silent: events and time in, one action out
-//! modbus    the Modbus TCP link
+//! modbus    the Modbus link: TCP, RTU, RTU over TCP
+//! line      a line under it: no old reply is taken for a new one
 //! ```
 
 mod contact;
 mod delivery;
 mod driver;
 mod limits;
+mod line;
 mod link;
 mod modbus;
+mod open;
 mod profile;
 mod profile_file;
+mod profile_transport;
+mod rs485;
 mod wire;
 
 pub use contact::RulesError;
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
 pub use driver::{IntentLog, LogError, deliver};
 pub use limits::{Reason, check_limits};
+pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
 pub use modbus::ModbusLink;
-pub use profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
+pub use open::serial_port;
+pub use profile::{
+    Deadlines, Line, ModbusFormat, Parity, Profile, Registers, Serial, StateBit, TableFormat, Transport,
+    WordOrder,
+};
 pub use profile_file::shipped_profiles;
 pub use wire::{
     Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, decode_status,

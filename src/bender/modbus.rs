@@ -1,20 +1,22 @@
-//! The Modbus TCP link: one request in flight, every reply checked, the connection dropped on any doubt.
+//! The Modbus link, over TCP and as RTU on lines: one request in flight, every reply checked, after any doubt the stream dropped or
+//! the line left alone.
 //!
-//! tokio-modbus has no deadlines and checks neither the count of a read nor the echo of a write; after a
-//! timeout a TCP stream stays off by one. So each call here has a deadline, compares what came with what was
-//! asked, and keeps the connection only when all is right; [`Contact`] says when the next one may be opened. A call that is
-//! cancelled drops its connection too, since the connection is taken out of `self` while it runs.
+//! tokio-modbus has no deadlines and checks neither the count of a read nor the echo of a write; after a timeout a TCP stream stays
+//! off by one, and an RTU client takes a late reply for the next one. So each call here has a deadline, compares what came
+//! with what was asked, and keeps the connection only when all is right; [`Contact`] says when the next request may be made. A line
+//! is kept through a doubt: it falls silent for as long as a reply may take, and what arrived is thrown away (`line`). A call
+//! that is cancelled is a doubt, too.
 
 use std::borrow::Cow;
 
-use tokio::net::TcpStream;
-use tokio::time::{Duration, Instant, timeout_at};
-use tokio_modbus::client::{Client as _, Context, tcp};
+use tokio::time::{Duration, Instant, sleep_until, timeout_at};
+use tokio_modbus::client::Client as _;
 use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
 use super::contact::{Action, Contact, Event, Rules, RulesError, State};
 use super::link::{ActiveTable, Bender, LinkError};
-use super::profile::Profile;
+use super::open::{Connection, open};
+use super::profile::{Profile, Transport};
 use super::wire::{
     Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image, status_span,
 };
@@ -26,24 +28,31 @@ const BUSY_RETRIES: u32 = 3;
 /// must be asked.
 const LONGEST_WAIT_SHARE: u64 = 4;
 
-/// A bender behind Modbus TCP.
+/// How often what a line garbled or lost is asked again.
+const LINE_RETRIES: u32 = 2;
+
+/// A bender behind Modbus.
 pub struct ModbusLink {
     profile: Profile,
     endpoint: String,
-    connection: Option<Context>,
+    connection: Option<Connection>,
     contact: Contact,
     since: Instant,
+    /// When something was last heard.
+    heard: Instant,
 }
 
 impl ModbusLink {
-    /// A link that connects at its first use; `endpoint` is `host:port`.
+    /// A link that connects at its first use; `endpoint` is what the profile's transport takes.
     pub fn new(profile: Profile, endpoint: impl Into<String>) -> Result<ModbusLink, RulesError> {
         let (endpoint, deadlines) = (endpoint.into(), &profile.deadlines);
         let first_ms = deadlines.poll_ms;
         let waits = (first_ms, (deadlines.confirm_ms / LONGEST_WAIT_SHARE).max(first_ms));
-        let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), None)?;
+        let silence_ms = profile.transport.line().map(|line| millis(line.quiet));
+        let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), silence_ms)?;
         let contact = Contact::new(rules, u64::from(crc_of(endpoint.as_bytes())));
-        Ok(ModbusLink { profile, endpoint, connection: None, contact, since: Instant::now() })
+        let now = Instant::now();
+        Ok(ModbusLink { profile, endpoint, connection: None, contact, since: now, heard: now })
     }
 
     /// Tells the contact what happened.
@@ -56,17 +65,16 @@ impl ModbusLink {
         self.since + Duration::from_millis(ms)
     }
 
-    async fn connect(&mut self, until_ms: u64) -> Result<Context, LinkError> {
-        let opened = match timeout_at(self.at(until_ms), TcpStream::connect(&self.endpoint)).await {
+    async fn connect(&mut self, until_ms: u64) -> Result<(), LinkError> {
+        let opened = match timeout_at(self.at(until_ms), open(&self.profile, &self.endpoint)).await {
             Ok(opened) => opened.map_err(|e| e.to_string()),
             Err(_) => Err(format!("no answer within {} ms", self.profile.deadlines.connect.as_millis())),
         };
         match opened {
-            Ok(stream) => {
-                // Small requests wait for each other otherwise; a socket that cannot do this still works.
-                let _ = stream.set_nodelay(true);
+            Ok(connection) => {
+                self.connection = Some(connection);
                 self.on(Event::Opened);
-                Ok(tcp::attach_slave(stream, Slave(self.profile.unit_id)))
+                Ok(())
             }
             Err(why) => {
                 self.on(Event::NotOpened);
@@ -75,19 +83,35 @@ impl ModbusLink {
         }
     }
 
-    /// The connection, opened if need be, and until when a reply is waited for.
-    async fn ready(&mut self) -> Result<(Context, Instant), LinkError> {
-        let mut connection = self.connection.take();
-        if connection.is_none() && !matches!(self.contact.state(), State::Away { .. }) {
+    /// Opens the connection if need be, and lets a line be silent; until when a reply is waited for.
+    async fn ready(&mut self) -> Result<Instant, LinkError> {
+        if matches!(self.contact.state(), State::Opening { .. } | State::Asking { .. }) {
             // The last call was cancelled.
-            self.on(Event::Doubted);
+            self.perform(Event::Doubted);
         }
         loop {
-            match (self.on(Event::Wanted), connection) {
-                (Action::Send { until_ms }, Some(open)) => return Ok((open, self.at(until_ms))),
-                (Action::Open { until_ms }, _) => connection = Some(self.connect(until_ms).await?),
-                (_, _) => return Err(self.resting()),
+            match self.on(Event::Wanted) {
+                Action::Send { until_ms } => return Ok(self.at(until_ms)),
+                Action::Open { until_ms } => self.connect(until_ms).await?,
+                Action::Refuse { until_ms } if matches!(self.contact.state(), State::Silent { .. }) => {
+                    sleep_until(self.at(until_ms)).await;
+                }
+                _ => return Err(self.resting()),
             }
+        }
+    }
+
+    /// Tells the contact what happened, and drops the connection where it says so.
+    fn perform(&mut self, event: Event) {
+        if self.on(event) == Action::Drop {
+            self.connection = None;
+        }
+    }
+
+    /// Between two frames on a serial line it is silent.
+    async fn let_frame_end(&mut self) {
+        if let Transport::ModbusRtu(_, serial) = &self.profile.transport {
+            sleep_until(self.heard + serial.gap()).await;
         }
     }
 
@@ -102,18 +126,23 @@ impl ModbusLink {
 
     /// One request and its checked reply.
     async fn call(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
-        let (mut connection, until) = self.ready().await?;
+        self.let_frame_end().await;
+        let until = self.ready().await?;
         let (endpoint, what) = (self.endpoint.clone(), describe(&request));
         let broken = |what, why| LinkError::Broken { endpoint: endpoint.clone(), what, why };
-        let (event, result) = match timeout_at(until, connection.call(request.clone())).await {
+        let Some(connection) = &mut self.connection else { return Err(self.resting()) };
+        let mut client = connection.client(Slave(self.profile.unit_id));
+        let answer = timeout_at(until, client.context().call(request.clone())).await;
+        self.heard = Instant::now();
+        let (event, result) = match answer {
             Err(_) => {
                 let ms = self.profile.deadlines.request.as_millis();
                 (Event::Doubted, Err(LinkError::Timeout { endpoint, what, ms }))
             }
-            Ok(Err(error @ tokio_modbus::Error::Transport(_))) => {
-                (Event::Closed, Err(broken(what, explain(&error))))
+            Ok(Err(error)) => {
+                let event = if is_closed(&error) { Event::Closed } else { Event::Doubted };
+                (event, Err(broken(what, explain(&error))))
             }
-            Ok(Err(error)) => (Event::Doubted, Err(broken(what, explain(&error)))),
             // A refusal is a proper answer.
             Ok(Ok(Err(exception))) => {
                 (Event::Answered, Err(LinkError::Exception { endpoint, what, exception: name(exception) }))
@@ -123,26 +152,26 @@ impl ModbusLink {
                 Err(why) => (Event::Doubted, Err(broken(what, why))),
             },
         };
-        self.on(event);
-        if self.contact.state() == State::Ready {
-            self.connection = Some(connection);
-        }
+        self.perform(event);
         result
     }
 
-    /// The same for requests that may be repeated: "busy" is asked again, a few times.
+    /// The same for requests that may be repeated: "busy" is asked again, a few times, and what a line garbled or lost.
     async fn call_patiently(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
         let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
         let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
-        for _ in 0..BUSY_RETRIES {
+        let line_retries = if self.profile.transport.line().is_some() { LINE_RETRIES } else { 0 };
+        let (mut patience, mut repeats) = (BUSY_RETRIES, line_retries);
+        loop {
             match self.call(request.clone()).await {
-                Err(LinkError::Exception { exception, .. }) if busy.contains(&exception) => {
+                Err(LinkError::Exception { exception, .. }) if patience > 0 && busy.contains(&exception) => {
+                    patience -= 1;
                     tokio::time::sleep(pause).await;
                 }
+                Err(LinkError::Timeout { .. } | LinkError::Broken { .. }) if repeats > 0 => repeats -= 1,
                 other => return other,
             }
         }
-        self.call(request).await
     }
 
     async fn read(&mut self, address: u16, bytes: usize) -> Result<Vec<u8>, LinkError> {
@@ -268,6 +297,11 @@ fn fits(request: &Request<'_>, response: Response) -> Result<Vec<u16>, String> {
         }
         (_, other) => Err(format!("the answer is to function {}", other.function_code())),
     }
+}
+
+/// Whether the other side closed the connection, or the device is gone; what is merely garbled says nothing of that.
+fn is_closed(error: &tokio_modbus::Error) -> bool {
+    matches!(error, tokio_modbus::Error::Transport(e) if e.kind() != std::io::ErrorKind::InvalidData)
 }
 
 fn explain(error: &tokio_modbus::Error) -> String {

@@ -9,12 +9,18 @@ use std::time::Duration;
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
-use crate::config::{ConfigError, Document, is_host_port};
+use super::profile::{
+    Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, Transport, WordOrder,
+};
+use super::profile_transport::{RawLine, RawSerial, RawTransport, parse_transport};
+use crate::config::{ConfigError, Document};
 use crate::tube::MachineLimits;
 
-const SHIPPED: [(&str, &str); 1] =
-    [("reference-modbus", include_str!("../../protocols/reference-modbus.toml"))];
+const SHIPPED: [(&str, &str); 3] = [
+    ("reference-modbus", include_str!("../../protocols/reference-modbus.toml")),
+    ("reference-rtu", include_str!("../../protocols/reference-rtu.toml")),
+    ("reference-rtu-over-tcp", include_str!("../../protocols/reference-rtu-over-tcp.toml")),
+];
 
 /// Names of the profiles that come with the program.
 pub fn shipped_profiles() -> impl Iterator<Item = &'static str> {
@@ -27,10 +33,11 @@ struct RawProfile {
     version: Spanned<i64>,
     name: Spanned<String>,
     description: Spanned<String>,
-    #[serde(rename = "transport")]
-    _transport: RawTransport,
+    transport: Spanned<RawTransport>,
     endpoint: Spanned<String>,
     unit_id: Spanned<i64>,
+    line: Option<RawLine>,
+    serial: Option<RawSerial>,
     modbus: RawModbus,
     registers: RawRegisters,
     constants: RawConstants,
@@ -38,13 +45,6 @@ struct RawProfile {
     state_bit: Vec<RawStateBit>,
     limits: RawLimits,
     deadlines: RawDeadlines,
-}
-
-/// The links that exist.
-#[derive(Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum RawTransport {
-    ModbusTcp,
 }
 
 #[derive(Deserialize)]
@@ -150,10 +150,12 @@ impl Profile {
         let raw: RawProfile = doc.parse()?;
         integer(doc, &raw.version, "version", 1..=1)?;
         let table = parse_table(doc, &raw.table)?;
+        let transport = parse_transport(doc, &raw.transport, raw.line.as_ref(), raw.serial.as_ref())?;
         let profile = Profile {
             name: text(doc, &raw.name, "name", 32)?,
             description: text(doc, &raw.description, "description", 200)?,
-            endpoint: endpoint(doc, &raw.endpoint)?,
+            endpoint: endpoint(doc, &raw.endpoint, &transport)?,
+            transport,
             unit_id: integer(doc, &raw.unit_id, "unit_id", 0..=255)? as u8,
             modbus: parse_modbus(doc, &raw.modbus)?,
             registers: parse_registers(doc, &raw.registers)?,
@@ -352,7 +354,7 @@ fn check_areas(doc: &Document, raw: &RawProfile, profile: &Profile) -> Result<()
     }
 }
 
-fn integer(
+pub(super) fn integer(
     doc: &Document,
     value: &Spanned<i64>,
     key: &str,
@@ -379,12 +381,12 @@ fn text(doc: &Document, value: &Spanned<String>, key: &str, longest: usize) -> R
     Ok(found.clone())
 }
 
-fn endpoint(doc: &Document, value: &Spanned<String>) -> Result<String, ConfigError> {
+fn endpoint(doc: &Document, value: &Spanned<String>, transport: &Transport) -> Result<String, ConfigError> {
     let found = value.get_ref();
-    if is_host_port(found) {
+    if transport.takes(found) {
         return Ok(found.clone());
     }
-    Err(doc.value_error(value.span(), "endpoint", format!("{found:?}"), "host:port, port from 1 to 65535"))
+    Err(doc.value_error(value.span(), "endpoint", format!("{found:?}"), transport.form()))
 }
 
 #[cfg(test)]

@@ -32,6 +32,18 @@ pub enum SetupError {
         /// Every reason.
         why: String,
     },
+    /// Its machine's link leads to no address of this form.
+    #[error("cell {cell} address = {address:?}, allowed for profile {profile} is {allowed}")]
+    Address {
+        /// The cell.
+        cell: String,
+        /// What was found.
+        address: String,
+        /// The machine's profile.
+        profile: String,
+        /// The form.
+        allowed: &'static str,
+    },
     /// It would be in the way of another cell or of the journal.
     #[error(
         "cell {cell} {key} = {found}, allowed is one of its own, neither around nor within another; {clash}"
@@ -92,6 +104,14 @@ impl Setup {
     fn load(config: &CellConfig, materials: &Materials) -> Result<Setup, SetupError> {
         let nominal = load_part(&config.part, materials)?;
         let profile = Profile::load(&config.profile)?;
+        if !profile.transport.takes(&config.address) {
+            return Err(SetupError::Address {
+                cell: config.name.clone(),
+                address: config.address.clone(),
+                profile: profile.name,
+                allowed: profile.transport.form(),
+            });
+        }
         let unit = match config.scan_unit {
             ScanUnit::M => Unit::Metre,
             ScanUnit::Mm => Unit::Millimetre,

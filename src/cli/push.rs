@@ -12,7 +12,7 @@ use crate::bender::{
     check_program, deliver, gate, prepare,
 };
 use crate::cell::JournalledIntents;
-use crate::config::{Table, is_host_port, read_table};
+use crate::config::{Table, read_table};
 use crate::correct::Verdict;
 use crate::journal::Journal;
 use crate::tube::{CommandTable, Lra};
@@ -26,7 +26,7 @@ pub struct Args {
     #[arg(long, value_name = "PROFILE")]
     bender: String,
     /// Where the machine is [default: the profile's endpoint].
-    #[arg(long, value_name = "HOST:PORT", value_parser = host_port)]
+    #[arg(long, value_name = "ADDRESS")]
     on: Option<String>,
     /// The program that must be loaded [default: the table's file name without its ending].
     #[arg(long, value_name = "NAME")]
@@ -92,6 +92,9 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     check_program(&profile, &program)
         .map_err(|reason| anyhow!("{reason}; give the machine's own with --program NAME"))?;
     let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
+    if !profile.transport.takes(&endpoint) {
+        bail!("--on {endpoint}: allowed is {}", profile.transport.form());
+    }
     let mut report = Report {
         bender: profile.name.clone(),
         endpoint: endpoint.clone(),
@@ -266,14 +269,6 @@ fn refuse_verdict(verdict: Verdict, notes: &[String]) -> Vec<Reason> {
     };
     let texts = std::iter::once(said).chain(notes.iter().map(String::as_str));
     texts.map(|text| Reason::new("verdict", None, text)).collect()
-}
-
-/// For clap: the form only, the host is looked up when connecting.
-fn host_port(text: &str) -> Result<String, String> {
-    match is_host_port(text) {
-        true => Ok(text.to_owned()),
-        false => Err("allowed is HOST:PORT with a port of 1 to 65535, for instance 192.168.1.20:502".into()),
-    }
 }
 
 /// The journal of a service is in its state directory, a person's in theirs.

@@ -1,13 +1,16 @@
-//! `benderd simulate bender`: a bender on a socket, until Ctrl-C or SIGTERM.
+//! `benderd simulate bender`: a bender on a socket or a serial line, until Ctrl-C or SIGTERM.
+
+use std::path::Path;
 
 use anyhow::{Context as _, bail};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::{Outcome, say};
-use crate::bender::Profile;
+use crate::bender::{Profile, Transport};
 use crate::sim::bender::{MachineEvent, MachineModel};
-use crate::sim::bender_server::{Fault, SimulatedBender};
+use crate::sim::bender_server::{Door, Fault, SimulatedBender};
+use crate::sim::pty::{Kept, machine_end};
 
 /// Arguments of `benderd simulate bender`.
 #[derive(Debug, clap::Args)]
@@ -15,8 +18,9 @@ pub struct Args {
     /// What kind of machine: a shipped profile's name or a profile file.
     #[arg(long, default_value = "reference-modbus")]
     profile: String,
-    /// Where to listen [default: the profile's endpoint]; port 0 takes a free one.
-    #[arg(long, value_name = "HOST:PORT")]
+    /// Where to be reached [default: the profile's endpoint]: HOST:PORT, port 0 takes a free one; for a serial profile a path:
+    /// the device there, or a pseudo terminal that is made under this name.
+    #[arg(long, value_name = "ADDRESS")]
     on: Option<String>,
     /// Name of the loaded program.
     #[arg(long, default_value = "bracket-17")]
@@ -46,10 +50,11 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
     let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
-    let listener = TcpListener::bind(&on).await.with_context(|| format!("--on {on}: cannot listen"))?;
+    let (door, _kept) =
+        open(&profile.transport, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
     let name = profile.name.clone();
     let model = MachineModel::new(profile, &args.program, args.bends);
-    let bender = SimulatedBender::start(listener, model, args.fault, |event| say(&describe(&event)))?;
+    let bender = SimulatedBender::start(door, model, args.fault, |event| say(&describe(&event)))?;
     say(&format!(
         "simulated bender {name} listens on {}; program {:?} with {} bends is loaded",
         bender.address(),
@@ -63,6 +68,18 @@ async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
     }
     say("stopped");
     Ok(Outcome::Done)
+}
+
+/// Opens where a transport's machines are reached, and what must be kept meanwhile.
+async fn open(transport: &Transport, on: &str) -> anyhow::Result<(Door, Option<Kept>)> {
+    Ok(match transport {
+        Transport::ModbusTcp => (Door::Tcp(TcpListener::bind(on).await?), None),
+        Transport::ModbusRtuOverTcp(_) => (Door::RtuOverTcp(TcpListener::bind(on).await?), None),
+        Transport::ModbusRtu(_, settings) => {
+            let end = machine_end(Path::new(on), settings)?;
+            (Door::Line(Box::new(end.wire), on.to_owned()), end.kept)
+        }
+    })
 }
 
 fn describe(event: &MachineEvent) -> String {

@@ -133,9 +133,10 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         return Err(doc.value_error(raw.name.span(), "cell.name", format!("{name:?}"), allowed));
     }
     let address = raw.address.get_ref();
-    if !is_host_port(address) {
+    // Which of the two the machine's profile asks for is seen when that is read.
+    if !is_host_port(address) && !is_device(address) {
         let key = format!("cell {name} address");
-        let allowed = "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\"";
+        let allowed = "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\", or the path of a serial port";
         return Err(doc.value_error(raw.address.span(), &key, format!("{address:?}"), allowed));
     }
     let settle_s = match &raw.scan.settle_s {
@@ -158,6 +159,11 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
 pub fn is_host_port(text: &str) -> bool {
     text.rsplit_once(':')
         .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok_and(|p| p > 0))
+}
+
+/// Whether a text has the form of a device's path; the device is not looked up.
+pub fn is_device(text: &str) -> bool {
+    text.starts_with('/') && text.len() > 1 && !text.chars().any(char::is_control)
 }
 
 /// What looks like a file is one; any other word is a built-in profile's name.

@@ -9,7 +9,9 @@ mod materials;
 mod part;
 mod tables;
 
-pub use daemon::{CellConfig, DaemonConfig, Mode, ScanUnit, is_host_port, load_daemon, parse_daemon};
+pub use daemon::{
+    CellConfig, DaemonConfig, Mode, ScanUnit, is_device, is_host_port, load_daemon, parse_daemon,
+};
 pub use document::{ConfigError, Document};
 pub use materials::Materials;
 pub use part::{load_part, parse_part};

@@ -1,23 +1,31 @@
-//! The simulated bender on a socket: Modbus TCP by tokio-modbus's server, with faults on demand.
+//! The simulated bender on a link: Modbus TCP by tokio-modbus's server, RTU on a line by its own, with faults on demand.
 
 use std::future::Future;
 use std::io;
-use std::net::{Shutdown, SocketAddr};
+use std::net::Shutdown;
 use std::pin::Pin;
 use std::str::FromStr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
 use tokio_modbus::server::Service;
 use tokio_modbus::server::tcp::Server;
 use tokio_modbus::{ExceptionCode, Request, Response, SlaveRequest};
 
+use crate::bender::Wire;
+
 use super::bender::{MachineEvent, MachineModel, Refusal};
+use super::faults::{LineFaults, ReplyFault};
+use super::rtu::{self, Answer as RtuAnswer, Heard, Listener};
 
 /// Cycle of the simulated controller's program.
 const CYCLE: Duration = Duration::from_millis(10);
+
+/// Silence after which a piece of a frame is given up.
+const GIVEN_UP: Duration = Duration::from_millis(20);
 
 /// A way to misbehave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -93,44 +101,70 @@ impl FromStr for Fault {
 /// A running simulated bender; stops when dropped.
 #[derive(Debug)]
 pub struct SimulatedBender {
-    model: Arc<Mutex<MachineModel>>,
     shared: Arc<Shared>,
-    address: SocketAddr,
+    address: String,
     tasks: [JoinHandle<()>; 2],
 }
 
+/// Where a simulated bender is reached.
+pub enum Door {
+    /// Modbus TCP.
+    Tcp(TcpListener),
+    /// RTU's frames over TCP.
+    RtuOverTcp(TcpListener),
+    /// RTU on a line, which people know by this name.
+    Line(Box<dyn Wire>, String),
+}
+
 impl SimulatedBender {
-    /// Serves a machine on a socket that is bound already. Must be called inside a tokio runtime.
+    /// Serves a machine at a door that is open already. Must be called inside a tokio runtime.
     pub fn start(
-        listener: TcpListener,
+        door: Door,
         mut model: MachineModel,
         fault: Option<Fault>,
         mut on_event: impl FnMut(MachineEvent) + Send + 'static,
     ) -> io::Result<SimulatedBender> {
-        let address = listener.local_addr()?;
         if let Some(fault) = fault {
             fault.prepare(&mut model);
         }
-        let model = Arc::new(Mutex::new(model));
-        let ticking = Arc::clone(&model);
+        let address = match &door {
+            Door::Tcp(listener) | Door::RtuOverTcp(listener) => listener.local_addr()?.to_string(),
+            Door::Line(_, name) => name.clone(),
+        };
+        let shared = Arc::new(Shared {
+            model: Mutex::new(model),
+            fault,
+            mute: Mutex::new(false),
+            line_faults: Mutex::new(None),
+        });
+        let ticking = Arc::clone(&shared);
         let cycle = tokio::spawn(async move {
             let mut interval = tokio::time::interval(CYCLE);
             loop {
                 interval.tick().await;
-                let event = lock(&ticking).tick();
+                let event = lock(&ticking.model).tick();
                 if let Some(event) = event {
                     on_event(event);
                 }
             }
         });
-        let shared = Arc::new(Shared { model: Arc::clone(&model), fault, mute: Mutex::new(false) });
-        let serving = tokio::spawn(serve(listener, Arc::clone(&shared)));
-        Ok(SimulatedBender { model, shared, address, tasks: [cycle, serving] })
+        let serving = Arc::clone(&shared);
+        let serving = match door {
+            Door::Tcp(listener) => tokio::spawn(serve(listener, serving)),
+            Door::RtuOverTcp(listener) => tokio::spawn(serve_lines(listener, serving)),
+            Door::Line(wire, _) => tokio::spawn(async move { serve_line(wire, &serving).await }),
+        };
+        Ok(SimulatedBender { shared, address, tasks: [cycle, serving] })
     }
 
-    /// Where it listens.
-    pub fn address(&self) -> SocketAddr {
-        self.address
+    /// Where it is reached.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// What happens to its answers on a line from now on.
+    pub fn set_line_faults(&self, faults: Option<LineFaults>) {
+        *lock(&self.shared.line_faults) = faults;
     }
 
     /// Answers again after `silent-after-commit`.
@@ -140,7 +174,7 @@ impl SimulatedBender {
 
     /// Looks at the machine, or acts as its operator.
     pub fn with<R>(&self, action: impl FnOnce(&mut MachineModel) -> R) -> R {
-        action(&mut lock(&self.model))
+        action(&mut lock(&self.shared.model))
     }
 }
 
@@ -167,12 +201,134 @@ async fn serve(listener: TcpListener, shared: Arc<Shared>) {
     }
 }
 
+/// One connection after the other: a device server has one line.
+async fn serve_lines(listener: TcpListener, shared: Arc<Shared>) {
+    loop {
+        match listener.accept().await {
+            Ok((stream, _)) => {
+                let _ = stream.set_nodelay(true); // answers would only be slower without
+                serve_line(stream, &shared).await;
+            }
+            Err(error) => {
+                tracing::error!(%error, "the simulated bender no longer takes connections");
+                return;
+            }
+        }
+    }
+}
+
+/// A unit on a line, until the line is closed or the machine hangs up.
+async fn serve_line(mut wire: impl AsyncRead + AsyncWrite + Unpin, shared: &Shared) {
+    let (mut listener, mut bytes) = (Listener::default(), [0; 512]);
+    loop {
+        let read = wire.read(&mut bytes);
+        let read = if listener.is_amid() {
+            match tokio::time::timeout(GIVEN_UP, read).await {
+                Ok(read) => read,
+                Err(_) => {
+                    listener.silence();
+                    continue;
+                }
+            }
+        } else {
+            read.await
+        };
+        let Ok(count @ 1..) = read else { return };
+        let Some(heard) = listener.take(&bytes[..count]) else { continue };
+        let answer = match shared.reply(heard.unit, &heard.request) {
+            Reply::Silence => continue,
+            Reply::HangUp => return,
+            Reply::Exception(code) => RtuAnswer::Exception(code.into()),
+            Reply::Words(words) => RtuAnswer::Words(words),
+            Reply::Written => RtuAnswer::Written,
+        };
+        tokio::time::sleep(shared.delay()).await;
+        let arriving = shared.on_the_line(&heard, &answer).await;
+        if wire.write_all(&arriving).await.is_err() || wire.flush().await.is_err() {
+            return;
+        }
+    }
+}
+
+/// What all links to one machine share.
 #[derive(Debug)]
 struct Shared {
-    model: Arc<Mutex<MachineModel>>,
+    model: Mutex<MachineModel>,
     fault: Option<Fault>,
     /// Answers nothing any more.
     mute: Mutex<bool>,
+    line_faults: Mutex<Option<LineFaults>>,
+}
+
+/// What a machine says to a request.
+enum Reply {
+    Silence,
+    /// The connection is cut; a line has none and is silent.
+    HangUp,
+    Exception(ExceptionCode),
+    Words(Vec<u16>),
+    Written,
+}
+
+impl Shared {
+    fn reply(&self, unit: u8, request: &rtu::Request) -> Reply {
+        let mut model = lock(&self.model);
+        let mut mute = lock(&self.mute);
+        if *mute || self.fault == Some(Fault::Silent) {
+            return Reply::Silence;
+        }
+        if self.fault == Some(Fault::Busy) {
+            return Reply::Exception(ExceptionCode::ServerDeviceBusy);
+        }
+        if unit != model.unit_id() {
+            return Reply::Silence;
+        }
+        match request {
+            rtu::Request::Read { address, count } => model
+                .read(*address, *count)
+                .map_or_else(|refusal| Reply::Exception(exception(refusal)), Reply::Words),
+            rtu::Request::Write { address, words } => {
+                let commits = *address == model.commit_address();
+                if commits && self.fault == Some(Fault::DropBeforeApply) {
+                    return Reply::HangUp;
+                }
+                if let Err(refusal) = model.write(*address, words) {
+                    return Reply::Exception(exception(refusal));
+                }
+                match self.fault {
+                    Some(Fault::DropAfterApply) if commits => Reply::HangUp,
+                    Some(Fault::SilentAfterCommit) if commits => {
+                        *mute = true;
+                        Reply::Silence
+                    }
+                    _ => Reply::Written,
+                }
+            }
+            rtu::Request::Other { .. } => Reply::Exception(ExceptionCode::IllegalFunction),
+        }
+    }
+
+    fn delay(&self) -> Duration {
+        match self.fault {
+            Some(Fault::Late { ms }) => Duration::from_millis(ms),
+            _ => Duration::ZERO,
+        }
+    }
+
+    /// The bytes that arrive of an answer, when they do.
+    async fn on_the_line(&self, heard: &Heard, answer: &RtuAnswer) -> Vec<u8> {
+        let bytes = rtu::encode(heard, answer);
+        let (arriving, fault) = {
+            let mut faults = lock(&self.line_faults);
+            let Some(faults) = faults.as_mut() else { return bytes };
+            let Some(fault) = faults.next() else { return bytes };
+            (faults.damage(fault, bytes), fault)
+        };
+        if let ReplyFault::Late { ms } = fault {
+            tokio::time::sleep(Duration::from_millis(ms)).await;
+        }
+        arriving
+    }
 }
 
 struct Connection {
@@ -189,11 +345,8 @@ impl Service for Connection {
     type Future = Pin<Box<dyn Future<Output = Answer> + Send>>;
 
     fn call(&self, request: Self::Request) -> Self::Future {
-        let answer = self.answer(&request);
-        let delay = match self.shared.fault {
-            Some(Fault::Late { ms }) => Duration::from_millis(ms),
-            _ => Duration::ZERO,
-        };
+        let answer = self.answer(request);
+        let delay = self.shared.delay();
         Box::pin(async move {
             tokio::time::sleep(delay).await;
             answer
@@ -202,47 +355,31 @@ impl Service for Connection {
 }
 
 impl Connection {
-    fn answer(&self, request: &SlaveRequest) -> Answer {
-        let mut model = lock(&self.shared.model);
-        let mut mute = lock(&self.shared.mute);
-        if *mute || self.shared.fault == Some(Fault::Silent) {
-            return Ok(None);
-        }
-        if self.shared.fault == Some(Fault::Busy) {
-            return Err(ExceptionCode::ServerDeviceBusy);
-        }
-        if request.slave != model.unit_id() {
+    fn answer(&self, SlaveRequest { slave, request }: SlaveRequest<'_>) -> Answer {
+        if slave != lock(&self.shared.model).unit_id() {
             return Err(ExceptionCode::GatewayTargetDevice);
         }
-        match &request.request {
-            Request::ReadHoldingRegisters(address, count) => {
-                let words = model.read(*address, *count).map_err(exception)?;
-                Ok(Some(Response::ReadHoldingRegisters(words)))
-            }
+        let request = match request {
+            Request::ReadHoldingRegisters(address, count) => rtu::Request::Read { address, count },
             Request::WriteMultipleRegisters(address, words) => {
-                let commits = *address == model.commit_address();
-                if commits && self.shared.fault == Some(Fault::DropBeforeApply) {
-                    return self.hang_up();
-                }
-                model.write(*address, words).map_err(exception)?;
-                match self.shared.fault {
-                    Some(Fault::DropAfterApply) if commits => return self.hang_up(),
-                    Some(Fault::SilentAfterCommit) if commits => {
-                        *mute = true;
-                        return Ok(None);
-                    }
-                    _ => {}
-                }
-                let count = u16::try_from(words.len()).map_err(|_| ExceptionCode::IllegalDataValue)?;
-                Ok(Some(Response::WriteMultipleRegisters(*address, count)))
+                rtu::Request::Write { address, words: words.into_owned() }
             }
-            _ => Err(ExceptionCode::IllegalFunction),
-        }
-    }
-
-    fn hang_up(&self) -> Answer {
-        let _ = self.cut.shutdown(Shutdown::Both); // already closed is closed
-        Ok(None)
+            other => rtu::Request::Other { function: other.function_code().value() },
+        };
+        let reply = self.shared.reply(slave, &request);
+        Ok(match (reply, request) {
+            (Reply::Words(words), _) => Some(Response::ReadHoldingRegisters(words)),
+            (Reply::Written, rtu::Request::Write { address, words }) => {
+                let count = u16::try_from(words.len()).map_err(|_| ExceptionCode::IllegalDataValue)?;
+                Some(Response::WriteMultipleRegisters(address, count))
+            }
+            (Reply::Exception(code), _) => return Err(code),
+            (Reply::HangUp, _) => {
+                let _ = self.cut.shutdown(Shutdown::Both); // already closed is closed
+                None
+            }
+            (Reply::Silence | Reply::Written, _) => None,
+        })
     }
 }
 

@@ -2,7 +2,10 @@
 
 pub mod bender;
 pub mod bender_server;
+pub mod faults;
 pub mod forming;
 pub mod population;
+pub mod pty;
+pub mod rtu;
 pub mod scan;
 pub mod scan_file;

@@ -1,0 +1,99 @@
+//! Opens what leads to a Modbus machine: a socket, or a serial port.
+//!
+//! Under `modbus`, which decides when.
+
+use std::io;
+
+use tokio::net::TcpStream;
+use tokio_modbus::Slave;
+use tokio_modbus::client::{Context, rtu, tcp};
+use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
+
+use super::line::Line;
+use super::profile::{Parity, Profile, Serial, Transport};
+use super::rs485;
+
+/// What leads to the machine, open.
+pub enum Connection {
+    /// A stream: one client as long as it lives.
+    Stream(Context),
+    /// A line: a new client for every request, so that nothing of the last one is left in it.
+    Line(Line),
+}
+
+impl Connection {
+    /// The client for one request.
+    pub fn client(&mut self, unit: Slave) -> Client<'_> {
+        match self {
+            Connection::Stream(context) => Client::Lasting(context),
+            Connection::Line(line) => Client::Once(rtu::attach_slave(line.clone(), unit)),
+        }
+    }
+}
+
+/// A client that lasts, or one for a single request.
+pub enum Client<'a> {
+    /// The stream's.
+    Lasting(&'a mut Context),
+    /// One on the line.
+    Once(Context),
+}
+
+impl Client<'_> {
+    /// The client itself.
+    pub fn context(&mut self) -> &mut Context {
+        match self {
+            Client::Lasting(context) => context,
+            Client::Once(context) => context,
+        }
+    }
+}
+
+/// Opens what a profile's transport leads over.
+pub async fn open(profile: &Profile, endpoint: &str) -> io::Result<Connection> {
+    match &profile.transport {
+        Transport::ModbusTcp => {
+            Ok(Connection::Stream(tcp::attach_slave(socket(endpoint).await?, Slave(profile.unit_id))))
+        }
+        Transport::ModbusRtuOverTcp(line) => {
+            Ok(Connection::Line(Line::new(Box::new(socket(endpoint).await?), line.echo)))
+        }
+        Transport::ModbusRtu(line, settings) => {
+            Ok(Connection::Line(Line::new(Box::new(serial_port(endpoint, settings)?), line.echo)))
+        }
+    }
+}
+
+async fn socket(endpoint: &str) -> io::Result<TcpStream> {
+    let stream = TcpStream::connect(endpoint).await?;
+    // Small requests wait for each other otherwise; a socket that cannot do this still works.
+    let _ = stream.set_nodelay(true);
+    Ok(stream)
+}
+
+/// Opens a serial port for this process alone.
+pub fn serial_port(path: &str, settings: &Serial) -> io::Result<SerialStream> {
+    let parity = match settings.parity {
+        Parity::None => tokio_serial::Parity::None,
+        Parity::Even => tokio_serial::Parity::Even,
+        Parity::Odd => tokio_serial::Parity::Odd,
+    };
+    let stop_bits = if settings.stop_bits == 2 { StopBits::Two } else { StopBits::One };
+    let builder =
+        tokio_serial::new(path, settings.baud).data_bits(DataBits::Eight).parity(parity).stop_bits(stop_bits);
+    let port = builder.open_native_async().map_err(|error| explain(error, path))?;
+    if settings.rs485 {
+        rs485::enable(&port)?;
+    }
+    Ok(port)
+}
+
+/// The library says "no such device" of a port that another process has open.
+fn explain(error: tokio_serial::Error, path: &str) -> io::Error {
+    let exists = std::path::Path::new(path).exists();
+    if exists && matches!(error.kind, tokio_serial::ErrorKind::NoDevice) {
+        let why = "another program has it open, or it is no serial port";
+        return io::Error::new(io::ErrorKind::ResourceBusy, why);
+    }
+    io::Error::from(error)
+}

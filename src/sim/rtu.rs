@@ -1,0 +1,203 @@
+//! Modbus RTU at the machine's end of a line: bytes to requests, answers to bytes. Pure; written from the standard
+//! (Modbus over serial line 1.02, application protocol 1.1b3), not from the client's library: the two check each other.
+
+/// Longest frame.
+const LONGEST: usize = 256;
+
+/// A request on the line, whosever it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Heard {
+    /// The unit that is asked.
+    pub unit: u8,
+    /// What for.
+    pub request: Request,
+}
+
+/// What is asked for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Request {
+    /// Function 3.
+    Read {
+        /// First register.
+        address: u16,
+        /// How many.
+        count: u16,
+    },
+    /// Function 16.
+    Write {
+        /// First register.
+        address: u16,
+        /// Their values.
+        words: Vec<u16>,
+    },
+    /// Any other function.
+    Other {
+        /// Its number.
+        function: u8,
+    },
+}
+
+impl Request {
+    fn function(&self) -> u8 {
+        match self {
+            Request::Read { .. } => 3,
+            Request::Write { .. } => 16,
+            Request::Other { function } => *function,
+        }
+    }
+}
+
+/// An answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Answer {
+    /// Registers that were read.
+    Words(Vec<u16>),
+    /// A write was done.
+    Written,
+    /// An exception's number.
+    Exception(u8),
+}
+
+/// The receiving side of a unit.
+#[derive(Debug, Default)]
+pub struct Listener {
+    buffer: Vec<u8>,
+}
+
+impl Listener {
+    /// Takes what arrived; a request when it is complete. What is no frame waits for [`Listener::silence`].
+    pub fn take(&mut self, bytes: &[u8]) -> Option<Heard> {
+        self.buffer.extend(bytes);
+        let length = self.length()?;
+        if self.buffer.len() < length {
+            return None;
+        }
+        let frame: Vec<u8> = self.buffer.drain(..length).collect();
+        let (body, crc) = frame.split_at(length - 2);
+        if crc16(body).to_le_bytes() != crc {
+            self.buffer.clear();
+            return None;
+        }
+        parse(body)
+    }
+
+    /// Nothing came for longer than a frame's gap: what is there is no frame, or one cut short.
+    pub fn silence(&mut self) {
+        self.buffer.clear();
+    }
+
+    /// Whether part of a frame is there.
+    pub fn is_amid(&self) -> bool {
+        !self.buffer.is_empty()
+    }
+
+    /// Length of the frame that begins here, as soon as that is known.
+    fn length(&self) -> Option<usize> {
+        match self.buffer.get(1)? {
+            3 => Some(8),
+            16 => self.buffer.get(6).map(|bytes| 9 + usize::from(*bytes)),
+            // Unknown functions end with the silence; up to then nobody can tell.
+            _ => (self.buffer.len() >= 4).then(|| self.buffer.len().min(LONGEST)),
+        }
+    }
+}
+
+fn parse(body: &[u8]) -> Option<Heard> {
+    let word = |at: usize| Some(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
+    let request = match *body.get(1)? {
+        3 => Request::Read { address: word(2)?, count: word(4)? },
+        16 => {
+            let words: Vec<u16> =
+                body.get(7..)?.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
+            // A count that disagrees with the bytes is not the request that it seems to be.
+            (words.len() == usize::from(word(4)?)).then_some(Request::Write { address: word(2)?, words })?
+        }
+        function => Request::Other { function },
+    };
+    Some(Heard { unit: body[0], request })
+}
+
+/// An answer as bytes.
+pub fn encode(heard: &Heard, answer: &Answer) -> Vec<u8> {
+    let function = heard.request.function();
+    let mut out = vec![heard.unit];
+    match (answer, &heard.request) {
+        (Answer::Words(words), _) => {
+            out.extend([function, (2 * words.len()) as u8]);
+            out.extend(words.iter().flat_map(|word| word.to_be_bytes()));
+        }
+        (Answer::Written, Request::Write { address, words }) => {
+            out.push(function);
+            out.extend(address.to_be_bytes());
+            out.extend((words.len() as u16).to_be_bytes());
+        }
+        (Answer::Written, _) => out.extend([function | 0x80, 4]),
+        (Answer::Exception(code), _) => out.extend([function | 0x80, *code]),
+    }
+    let crc = crc16(&out);
+    out.extend(crc.to_le_bytes());
+    out
+}
+
+/// CRC-16 of Modbus: reflected polynomial 0xA001, start 0xFFFF.
+pub fn crc16(bytes: &[u8]) -> u16 {
+    bytes.iter().fold(0xFFFF, |crc, byte| {
+        (0..8).fold(crc ^ u16::from(*byte), |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Unit 17 is asked for registers 107 to 109.
+    const READ: [u8; 8] = [0x11, 0x03, 0x00, 0x6B, 0x00, 0x03, 0x76, 0x87];
+
+    #[test]
+    fn frames_written_out_by_hand() {
+        assert_eq!(crc16(b"123456789"), 0x4B37, "the check value of CRC-16/MODBUS");
+        let heard = Listener::default().take(&READ).unwrap();
+        assert_eq!(heard, Heard { unit: 17, request: Request::Read { address: 107, count: 3 } });
+        let answer = encode(&heard, &Answer::Words(vec![0xAE41, 0x5652, 0x4340]));
+        assert_eq!(answer, [0x11, 0x03, 0x06, 0xAE, 0x41, 0x56, 0x52, 0x43, 0x40, 0x49, 0xAD]);
+        assert_eq!(encode(&heard, &Answer::Exception(2))[..3], [0x11, 0x83, 2]);
+    }
+
+    #[test]
+    fn a_broken_frame_is_not_answered_and_the_next_one_is() {
+        let mut listener = Listener::default();
+        let mut broken = READ;
+        broken[3] ^= 1;
+        assert_eq!(listener.take(&broken), None);
+        assert!(listener.take(&READ).is_some());
+        assert_eq!(listener.take(&READ[..5]), None);
+        listener.silence();
+        assert!(listener.take(&READ).is_some());
+    }
+
+    proptest! {
+        #[test]
+        fn a_write_arrives_in_whatever_pieces(address in any::<u16>(), words in proptest::collection::vec(any::<u16>(), 1..123), cut in 1..20_usize) {
+            let mut frame = vec![1, 16];
+            frame.extend(address.to_be_bytes());
+            frame.extend((words.len() as u16).to_be_bytes());
+            frame.push(2 * words.len() as u8);
+            frame.extend(words.iter().flat_map(|w| w.to_be_bytes()));
+            let crc = crc16(&frame);
+            frame.extend(crc.to_le_bytes());
+            let mut listener = Listener::default();
+            let heard: Vec<Heard> = frame.chunks(cut).filter_map(|piece| listener.take(piece)).collect();
+            prop_assert_eq!(&heard, &[Heard { unit: 1, request: Request::Write { address, words } }]);
+        }
+
+        #[test]
+        fn no_bytes_do_harm(bytes in proptest::collection::vec(any::<u8>(), 0..600), cut in 1..50_usize) {
+            let mut listener = Listener::default();
+            for piece in bytes.chunks(cut) {
+                listener.take(piece);
+                prop_assert!(listener.buffer.len() <= LONGEST + 50);
+            }
+        }
+    }
+}
