@@ -5,6 +5,7 @@
 //! answer to the next request: tokio-modbus compares unit and function only.
 
 use std::collections::VecDeque;
+use std::fmt::Debug;
 use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -16,9 +17,9 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 const MOST_STALE: usize = 64 * 1024;
 
 /// What a line is made of: a serial port, or a socket that stands for one.
-pub trait Wire: AsyncRead + AsyncWrite + Send + Unpin {}
+pub trait Wire: AsyncRead + AsyncWrite + Debug + Send + Unpin {}
 
-impl<T: AsyncRead + AsyncWrite + Send + Unpin> Wire for T {}
+impl<T: AsyncRead + AsyncWrite + Debug + Send + Unpin> Wire for T {}
 
 /// An open line on which every request begins with an empty input. Its clones are the same line.
 #[derive(Clone)]
@@ -186,6 +187,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_line_that_never_falls_silent_is_an_error() {
+        #[derive(Debug)]
         struct Babble;
         impl AsyncRead for Babble {
             fn poll_read(

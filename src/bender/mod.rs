@@ -35,7 +35,7 @@ pub use limits::{Reason, check_limits};
 pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
 pub use modbus::ModbusLink;
-pub use open::serial_port;
+pub use open::{Opener, serial_port};
 pub use profile::{
     Deadlines, Line, ModbusFormat, Parity, Profile, Registers, Serial, StateBit, TableFormat, Transport,
     WordOrder,

@@ -15,7 +15,7 @@ use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
 use super::contact::{Action, Contact, Event, Rules, RulesError, State};
 use super::link::{ActiveTable, Bender, LinkError};
-use super::open::{Connection, open};
+use super::open::{Connection, Opener, open};
 use super::profile::{Profile, Transport};
 use super::wire::{
     Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image, status_span,
@@ -35,6 +35,7 @@ const LINE_RETRIES: u32 = 2;
 pub struct ModbusLink {
     profile: Profile,
     endpoint: String,
+    opener: Option<Opener>,
     connection: Option<Connection>,
     contact: Contact,
     since: Instant,
@@ -52,7 +53,16 @@ impl ModbusLink {
         let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), silence_ms)?;
         let contact = Contact::new(rules, u64::from(crc_of(endpoint.as_bytes())));
         let now = Instant::now();
-        Ok(ModbusLink { profile, endpoint, connection: None, contact, since: now, heard: now })
+        Ok(ModbusLink { profile, endpoint, opener: None, connection: None, contact, since: now, heard: now })
+    }
+
+    /// The same over wires that `opener` makes; the endpoint is their name.
+    pub fn over(
+        profile: Profile,
+        endpoint: impl Into<String>,
+        opener: Opener,
+    ) -> Result<ModbusLink, RulesError> {
+        Ok(ModbusLink { opener: Some(opener), ..ModbusLink::new(profile, endpoint)? })
     }
 
     /// Tells the contact what happened.
@@ -66,7 +76,9 @@ impl ModbusLink {
     }
 
     async fn connect(&mut self, until_ms: u64) -> Result<(), LinkError> {
-        let opened = match timeout_at(self.at(until_ms), open(&self.profile, &self.endpoint)).await {
+        let until = self.at(until_ms);
+        let opening = open(&self.profile, &self.endpoint, self.opener.as_mut());
+        let opened = match timeout_at(until, opening).await {
             Ok(opened) => opened.map_err(|e| e.to_string()),
             Err(_) => Err(format!("no answer within {} ms", self.profile.deadlines.connect.as_millis())),
         };

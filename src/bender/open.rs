@@ -1,4 +1,4 @@
-//! Opens what leads to a Modbus machine: a socket, or a serial port.
+//! Opens what leads to a Modbus machine: a socket, a serial port, or what stands for one.
 //!
 //! Under `modbus`, which decides when.
 
@@ -9,7 +9,7 @@ use tokio_modbus::Slave;
 use tokio_modbus::client::{Context, rtu, tcp};
 use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
 
-use super::line::Line;
+use super::line::{Line, Wire};
 use super::profile::{Parity, Profile, Serial, Transport};
 use super::rs485;
 
@@ -49,19 +49,20 @@ impl Client<'_> {
     }
 }
 
+/// Opens a wire that is no device of this computer: one in memory.
+pub type Opener = Box<dyn FnMut() -> io::Result<Box<dyn Wire>> + Send>;
+
 /// Opens what a profile's transport leads over.
-pub async fn open(profile: &Profile, endpoint: &str) -> io::Result<Connection> {
-    match &profile.transport {
-        Transport::ModbusTcp => {
-            Ok(Connection::Stream(tcp::attach_slave(socket(endpoint).await?, Slave(profile.unit_id))))
-        }
-        Transport::ModbusRtuOverTcp(line) => {
-            Ok(Connection::Line(Line::new(Box::new(socket(endpoint).await?), line.echo)))
-        }
-        Transport::ModbusRtu(line, settings) => {
-            Ok(Connection::Line(Line::new(Box::new(serial_port(endpoint, settings)?), line.echo)))
-        }
-    }
+pub async fn open(profile: &Profile, endpoint: &str, opener: Option<&mut Opener>) -> io::Result<Connection> {
+    let wire: Box<dyn Wire> = match (opener, &profile.transport) {
+        (Some(opener), _) => opener()?,
+        (None, Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_)) => Box::new(socket(endpoint).await?),
+        (None, Transport::ModbusRtu(_, settings)) => Box::new(serial_port(endpoint, settings)?),
+    };
+    Ok(match profile.transport.line() {
+        None => Connection::Stream(tcp::attach_slave(wire, Slave(profile.unit_id))),
+        Some(line) => Connection::Line(Line::new(wire, line.echo)),
+    })
 }
 
 async fn socket(endpoint: &str) -> io::Result<TcpStream> {

@@ -318,15 +318,17 @@ impl Shared {
     /// The bytes that arrive of an answer, when they do.
     async fn on_the_line(&self, heard: &Heard, answer: &RtuAnswer) -> Vec<u8> {
         let bytes = rtu::encode(heard, answer);
-        let (arriving, fault) = {
+        let (arriving, ms) = {
             let mut faults = lock(&self.line_faults);
             let Some(faults) = faults.as_mut() else { return bytes };
-            let Some(fault) = faults.next() else { return bytes };
-            (faults.damage(fault, bytes), fault)
+            let usual_ms = faults.usual_ms();
+            match faults.next() {
+                None => (bytes, usual_ms),
+                Some(fault @ ReplyFault::Late { ms }) => (faults.damage(fault, bytes), usual_ms + ms),
+                Some(fault) => (faults.damage(fault, bytes), usual_ms),
+            }
         };
-        if let ReplyFault::Late { ms } = fault {
-            tokio::time::sleep(Duration::from_millis(ms)).await;
-        }
+        tokio::time::sleep(Duration::from_millis(ms)).await;
         arriving
     }
 }

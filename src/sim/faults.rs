@@ -25,6 +25,9 @@ pub enum ReplyFault {
     Garbage,
 }
 
+/// An answer takes up to this long anyway.
+const USUAL_MS: u64 = 15;
+
 /// Faults by chance.
 #[derive(Debug, Clone)]
 pub struct LineFaults {
@@ -38,6 +41,11 @@ impl LineFaults {
     /// Of a thousand answers so many have a fault; late ones come up to `latest_ms` later.
     pub fn new(seed: u64, per_mille: u32, latest_ms: u64) -> LineFaults {
         LineFaults { rng: ChaCha8Rng::seed_from_u64(seed), per_mille, latest_ms }
+    }
+
+    /// How long the next answer takes, in milliseconds.
+    pub fn usual_ms(&mut self) -> u64 {
+        self.rng.random_range(1..=USUAL_MS)
     }
 
     /// What happens to the next answer.

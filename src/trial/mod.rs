@@ -6,10 +6,12 @@
 //! record    one part, as a table
 //! story     what is told before, between and after
 //! picture   all parts as one SVG
+//! deliveries  many deliveries over a link that fails
 //! accuracy  how right and how accurate the reconstruction is
 //! ```
 
 pub mod accuracy;
+pub mod deliveries;
 mod demo;
 mod picture;
 mod record;

@@ -1,0 +1,262 @@
+//! Many deliveries over a link that fails: random tables, damaged answers, trouble at the machine, all by a seed; and what must hold
+//! afterwards, whatever happened.
+//!
+//! Under tokio's paused clock ten thousand of them take seconds; over a real line, as long as they take.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::TrialError;
+use crate::bender::{
+    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, crc_of, deliver,
+    encode_payload,
+};
+use crate::sim::bender::{MachineEvent, MachineModel};
+use crate::sim::bender_server::{Door, SimulatedBender};
+use crate::sim::faults::LineFaults;
+use crate::tube::{CommandRow, CommandTable};
+
+/// Room for bytes on a wire in memory.
+const WIRE_BYTES: usize = 4096;
+
+/// The program that the machine has loaded.
+const PROGRAM: &str = "P1";
+
+/// Trouble at the machine comes within this time of the delivery's begin, in one of so many deliveries.
+const TROUBLE_WITHIN_MS: u64 = 400;
+const TROUBLE_ONE_IN: u32 = 4;
+
+/// The longest that is waited for a machine to come back, in looks of one second.
+const LOOKS: usize = 30;
+
+/// What became of one delivery.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Ending {
+    /// In force.
+    Applied,
+    /// Refused by the gate or by the machine.
+    Rejected,
+    /// Failed before the commit, or the machine did not take it.
+    NotApplied,
+    /// Not known at first; a later look showed the new table.
+    UnknownThenApplied,
+    /// Not known at first; a later look showed another table.
+    UnknownThenNot,
+}
+
+/// How often each ending came about, and what must never be.
+#[derive(Debug, Clone, Default)]
+pub struct Totals {
+    /// Counts.
+    pub endings: BTreeMap<Ending, usize>,
+    /// Seeds where something that must hold did not, and what.
+    pub wrong: Vec<(u64, String)>,
+}
+
+impl Totals {
+    /// Adds one case.
+    pub fn add(&mut self, seed: u64, case: Result<Ending, String>) {
+        match case {
+            Ok(ending) => *self.endings.entry(ending).or_default() += 1,
+            Err(what) => self.wrong.push((seed, what)),
+        }
+    }
+}
+
+impl fmt::Display for Totals {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let of = |ending| self.endings.get(&ending).copied().unwrap_or(0);
+        write!(
+            f,
+            "applied {}, rejected {}, not applied {}, unknown then resolved {} (applied {}, not {}); wrong {}",
+            of(Ending::Applied),
+            of(Ending::Rejected),
+            of(Ending::NotApplied),
+            of(Ending::UnknownThenApplied) + of(Ending::UnknownThenNot),
+            of(Ending::UnknownThenApplied),
+            of(Ending::UnknownThenNot),
+            self.wrong.len()
+        )
+    }
+}
+
+/// The machine's end of a wire, and a link at the other end.
+pub struct Ends {
+    /// Where the machine is reached.
+    pub door: Door,
+    /// What reaches it.
+    pub link: ModbusLink,
+}
+
+/// A wire in memory.
+pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
+    let (here, there) = tokio::io::duplex(WIRE_BYTES);
+    let mut wire = Some(here);
+    let open = move || {
+        let again = || std::io::Error::other("a line in memory is opened once");
+        wire.take().map(|w| Box::new(w) as Box<dyn crate::bender::Wire>).ok_or_else(again)
+    };
+    let link = ModbusLink::over(profile.clone(), "a line in memory", Box::new(open))?;
+    Ok(Ends { door: Door::Line(Box::new(there), "a line in memory".into()), link })
+}
+
+/// One delivery; what must hold and did not.
+pub async fn run(
+    seed: u64,
+    per_mille: u32,
+    profile: &Profile,
+    ends: Ends,
+) -> Result<Result<Ending, String>, TrialError> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let bends = rng.random_range(1..=profile.limits.max_bends);
+    let encode = |table: &CommandTable| encode_payload(profile, PROGRAM, table).unwrap_or_default();
+    let old = encode(&table(&mut rng, bends));
+    let job = Job { program: PROGRAM.into(), table: table(&mut rng, bends), expected_active: None };
+    let new = encode(&job.table);
+    let edited = encode(&table(&mut rng, bends));
+
+    let mut model = MachineModel::new(profile.clone(), PROGRAM, bends as u16);
+    model.edit_at_screen(old.clone());
+    let events = Arc::new(Mutex::new(Vec::new()));
+    let told = Arc::clone(&events);
+    let bender = SimulatedBender::start(ends.door, model, None, move |event| lock(&told).push(event))?;
+    let latest_ms = profile.transport.line().map_or(0, |line| line.quiet.as_millis() as u64);
+    bender.set_line_faults(Some(LineFaults::new(seed, per_mille, latest_ms)));
+    let trouble = trouble(&mut rng);
+
+    let (mut link, mut log) = (ends.link, Memory::default());
+    let outcome = {
+        let delivery = deliver(&mut link, &job, &mut log);
+        let after = Duration::from_millis(rng.random_range(0..TROUBLE_WITHIN_MS));
+        let machine = async {
+            tokio::time::sleep(after).await;
+            bender.with(|m| trouble(m, &edited));
+            std::future::pending::<()>().await;
+        };
+        tokio::select! {
+            outcome = delivery => outcome,
+            () = machine => return Ok(Err("the machine's own time ended".into())),
+        }
+    };
+    bender.set_line_faults(None);
+    bender.with(|m| m.frozen = false);
+    // What was still under way has arrived, and the machine has dealt with it.
+    tokio::time::sleep(Duration::from_millis(profile.deadlines.settle_ms)).await;
+    let active = bender.with(|m| (m.active(), m.active_payload()));
+    let events = lock(&events).clone();
+    let found = Found { outcome, active, events, intents: log.intents, old, new, edited };
+    Ok(match found.check() {
+        Err(what) => Err(what),
+        Ok(()) => found.ending(&mut link).await,
+    })
+}
+
+/// What a delivery left behind.
+struct Found {
+    outcome: Outcome,
+    active: (TableId, Vec<u8>),
+    events: Vec<MachineEvent>,
+    intents: Vec<Intent>,
+    old: Vec<u8>,
+    new: Vec<u8>,
+    edited: Vec<u8>,
+}
+
+impl Found {
+    /// Whether the machine holds a whole table that somebody meant, and the record agrees with it.
+    fn check(&self) -> Result<(), String> {
+        let (id, payload) = &self.active;
+        if crc_of(payload) != id.crc || ![&self.old, &self.new, &self.edited].contains(&payload) {
+            return Err(format!("the active table is neither the old nor the new one, whole: {id}"));
+        }
+        let commits = self.events.len();
+        if commits > self.intents.len() || self.intents.len() > 1 {
+            return Err(format!("{commits} commits arrived, {} intents were journalled", self.intents.len()));
+        }
+        let taken = self.events.iter().any(|e| matches!(e, MachineEvent::TakenOver { .. }));
+        match &self.outcome {
+            Outcome::Applied(_) if !taken => Err("said to be applied, never taken over".into()),
+            Outcome::Rejected { .. } | Outcome::NotApplied { .. } if taken => {
+                Err(format!("taken over, and said to be {:?}", self.outcome))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// What became of it; of what is unknown, by a later look.
+    async fn ending(&self, link: &mut ModbusLink) -> Result<Ending, String> {
+        Ok(match &self.outcome {
+            Outcome::Applied(_) | Outcome::AlreadyActive(_) => Ending::Applied,
+            Outcome::Rejected { .. } => Ending::Rejected,
+            Outcome::NotApplied { .. } => Ending::NotApplied,
+            Outcome::Unknown { .. } => {
+                let mut seen = Err("never".to_owned());
+                for _ in 0..LOOKS {
+                    tokio::time::sleep(Duration::from_secs(1)).await;
+                    seen = link.read_active().await.map_err(|e| e.to_string());
+                    if seen.is_ok() {
+                        break;
+                    }
+                }
+                let seen = seen.map_err(|e| format!("unknown, and the machine is not heard again: {e}"))?;
+                if (seen.status.active, &seen.payload) != (self.active.0, &self.active.1) {
+                    return Err("the later look shows what is not there".into());
+                }
+                let applied = seen.payload == self.new;
+                if applied { Ending::UnknownThenApplied } else { Ending::UnknownThenNot }
+            }
+        })
+    }
+}
+
+/// A table that any machine can make.
+fn table(rng: &mut ChaCha8Rng, bends: usize) -> CommandTable {
+    let mut row = || CommandRow {
+        length_mm: rng.random_range(20.0..500.0),
+        rotation_rad: rng.random_range(-3.0..3.0),
+        angle_rad: rng.random_range(0.1..3.0),
+    };
+    CommandTable { bends: (0..bends).map(|_| row()).collect(), last_length_mm: 50.0 }
+}
+
+type Trouble = fn(&mut MachineModel, &[u8]);
+
+/// What happens at the machine meanwhile: mostly nothing.
+fn trouble(rng: &mut ChaCha8Rng) -> Trouble {
+    if rng.random_range(0..TROUBLE_ONE_IN) > 0 {
+        return |_, _| ();
+    }
+    match rng.random_range(0..5) {
+        0 => |m, _| m.power_cycle(),
+        1 => |m, edited| m.edit_at_screen(edited.to_vec()),
+        2 => |m, _| m.set_between_parts(false),
+        3 => |m, _| m.frozen = true,
+        _ => |m, _| m.rename_program("P2"),
+    }
+}
+
+/// Keeps what a journal would keep.
+#[derive(Default)]
+struct Memory {
+    intents: Vec<Intent>,
+}
+
+impl IntentLog for Memory {
+    fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
+        self.intents.push(intent.clone());
+        Ok(())
+    }
+
+    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
+        Ok(())
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

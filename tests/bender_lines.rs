@@ -1,0 +1,197 @@
+//! The Modbus link on lines: late answers, echoes, garbage; deliveries over a line in memory, a pseudo terminal and a device server.
+
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
+use std::time::Duration;
+
+use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, Transport, Wire};
+use benderd::sim::bender_server::Door;
+use benderd::sim::pty::machine_end;
+use benderd::sim::rtu::{Answer, Listener, Request, encode};
+use benderd::trial::deliveries::{Ending, Ends, Totals, in_memory, run};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
+use tokio::net::TcpListener;
+use tokio_modbus::Slave;
+use tokio_modbus::client::{Reader as _, rtu};
+
+const REQUEST_MS: u64 = 300;
+const QUIET_MS: u64 = 500;
+
+/// Four registers a request.
+fn profile() -> Profile {
+    let mut profile = Profile::load("reference-rtu").unwrap();
+    profile.deadlines.request = Duration::from_millis(REQUEST_MS);
+    profile.modbus.max_read_registers = 4;
+    profile
+}
+
+fn link(profile: Profile, wire: DuplexStream) -> ModbusLink {
+    let mut wire = Some(wire);
+    let open = move || Ok(Box::new(wire.take().unwrap()) as Box<dyn Wire>);
+    ModbusLink::over(profile, "a line in memory", Box::new(open)).unwrap()
+}
+
+/// A unit whose registers hold their own addresses. Before each answer it waits as long as the list says, then not at all.
+async fn unit(mut wire: DuplexStream, delays_ms: &[u64]) {
+    let (mut listener, mut bytes, mut delays) = (Listener::default(), [0; 256], delays_ms.iter());
+    while let Ok(count @ 1..) = wire.read(&mut bytes).await {
+        let Some(heard) = listener.take(&bytes[..count]) else { continue };
+        let Request::Read { address, count } = heard.request else { panic!("{heard:?}") };
+        tokio::time::sleep(Duration::from_millis(*delays.next().unwrap_or(&0))).await;
+        let words = (address..address + count).collect();
+        wire.write_all(&encode(&heard, &Answer::Words(words))).await.unwrap();
+    }
+}
+
+fn words(bytes: &[u8]) -> Vec<u16> {
+    bytes.chunks_exact(2).map(|p| u16::from_be_bytes([p[0], p[1]])).collect()
+}
+
+/// Why lines need the silence and the emptied input: the library takes the late answer for the next one, without an error. When it
+/// no longer does, this test says so.
+#[tokio::test(start_paused = true)]
+async fn the_library_alone_takes_a_late_answer_for_the_next_one() {
+    let (here, there) = duplex(4096);
+    tokio::spawn(async move { unit(there, &[REQUEST_MS + 100]).await });
+    let mut client = rtu::attach_slave(here, Slave(1));
+    let first = client.read_holding_registers(1000, 4);
+    assert!(tokio::time::timeout(Duration::from_millis(REQUEST_MS), first).await.is_err());
+    let second = client.read_holding_registers(2000, 4).await.unwrap().unwrap();
+    assert_eq!(second, [1000, 1001, 1002, 1003], "asked were 2000 to 2003");
+}
+
+/// The same line: what was late is thrown away, and the request repeated.
+#[tokio::test(start_paused = true)]
+async fn a_late_answer_is_never_taken_for_the_next_one() {
+    // Up to the last moment in which the silence lasts.
+    for late_ms in [REQUEST_MS + 1, REQUEST_MS + 100, REQUEST_MS + QUIET_MS - 1] {
+        let (here, there) = duplex(4096);
+        tokio::spawn(async move { unit(there, &[late_ms, 0, late_ms]).await });
+        let mut link = link(profile(), here);
+        let staging = link.read_staging(24).await.unwrap();
+        assert_eq!(words(&staging), (1000..1012).collect::<Vec<u16>>(), "{late_ms} ms");
+    }
+}
+
+/// An answer that comes when the next request is out already is that one's, as far as anybody can tell: what is lost after that
+/// must be less than what `quiet_ms` promises.
+#[tokio::test(start_paused = true)]
+async fn nothing_is_sent_before_the_silence_is_over() {
+    let (here, mut there) = duplex(4096);
+    let asked = tokio::spawn(async move {
+        let (mut times, mut bytes) = (Vec::new(), [0; 256]);
+        while let Ok(1..) = there.read(&mut bytes).await {
+            times.push(tokio::time::Instant::now());
+        }
+        times
+    });
+    let mut link = link(profile(), here);
+    let error = link.read_staging(8).await.unwrap_err();
+    assert!(matches!(error, LinkError::Timeout { .. }), "{error}");
+    drop(link);
+    let times = asked.await.unwrap();
+    let apart: Vec<u128> = times.windows(2).map(|w| (w[1] - w[0]).as_millis()).collect();
+    assert_eq!(apart, [800, 800], "once and twice more, each after the deadline and the silence");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_call_that_is_cancelled_leaves_the_line_silent_too() {
+    let (here, there) = duplex(4096);
+    tokio::spawn(async move { unit(there, &[100]).await });
+    let mut link = link(profile(), here);
+    let begun = tokio::time::Instant::now();
+    assert!(tokio::time::timeout(Duration::from_millis(50), link.read_staging(8)).await.is_err());
+    assert_eq!(words(&link.read_staging(8).await.unwrap()), [1000, 1001, 1002, 1003]);
+    assert!(begun.elapsed() >= Duration::from_millis(50 + QUIET_MS), "{:?}", begun.elapsed());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_line_with_an_echo_works_when_the_profile_says_so() {
+    let (here, mut line) = duplex(4096);
+    let (machine, there) = duplex(4096);
+    tokio::spawn(async move { unit(there, &[]).await });
+    tokio::spawn(async move {
+        let (mut from_machine, mut to_machine) = tokio::io::split(machine);
+        let (mut request, mut answer) = ([0; 256], [0; 256]);
+        while let Ok(count @ 1..) = line.read(&mut request).await {
+            line.write_all(&request[..count]).await.unwrap();
+            to_machine.write_all(&request[..count]).await.unwrap();
+            let count = from_machine.read(&mut answer).await.unwrap();
+            line.write_all(&answer[..count]).await.unwrap();
+        }
+    });
+    let mut profile = profile();
+    let Transport::ModbusRtu(settings, _) = &mut profile.transport else { panic!() };
+    settings.echo = true;
+    let staging = link(profile, here).read_staging(8).await.unwrap();
+    assert_eq!(words(&staging), [1000, 1001, 1002, 1003]);
+}
+
+/// 400 seeds with every tenth answer damaged, and trouble at the machine; `examples/deliveries` runs more.
+#[test]
+fn whatever_a_line_does_the_table_is_whole_and_the_record_true() {
+    let profile = Profile::load("reference-rtu").unwrap();
+    let mut totals = Totals::default();
+    for seed in 1..=400 {
+        let runtime =
+            tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build().unwrap();
+        let case = runtime.block_on(async { run(seed, 100, &profile, in_memory(&profile).unwrap()).await });
+        totals.add(seed, case.unwrap());
+    }
+    assert!(totals.wrong.is_empty(), "{totals}: {:?}", totals.wrong);
+    assert!(totals.endings[&Ending::Applied] > 300, "{totals}");
+    assert!(totals.endings.len() >= 4, "nearly every ending came about: {totals}");
+}
+
+/// Deadlines for a line that answers at once.
+fn quick(name: &str) -> Profile {
+    let mut profile = Profile::load(name).unwrap();
+    profile.deadlines.request = Duration::from_millis(200);
+    profile.deadlines.settle_ms = 50;
+    profile
+}
+
+#[tokio::test]
+async fn a_table_is_delivered_through_a_pseudo_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bender");
+    let profile = quick("reference-rtu");
+    let Transport::ModbusRtu(_, settings) = &profile.transport else { panic!() };
+    let end = machine_end(&path, settings).unwrap();
+    let link = ModbusLink::new(profile.clone(), path.display().to_string()).unwrap();
+    let ends = Ends { door: Door::Line(Box::new(end.wire), "a pseudo terminal".into()), link };
+    assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
+    drop(end.kept);
+    assert!(!path.is_symlink(), "its name is taken away");
+}
+
+#[tokio::test]
+async fn a_table_is_delivered_through_a_device_server() {
+    let profile = quick("reference-rtu-over-tcp");
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let link = ModbusLink::new(profile.clone(), listener.local_addr().unwrap().to_string()).unwrap();
+    let ends = Ends { door: Door::RtuOverTcp(listener), link };
+    assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
+}
+
+#[tokio::test]
+async fn a_port_that_another_program_has_open_or_that_cannot_do_rs485_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bender");
+    let mut profile = quick("reference-rtu");
+    let Transport::ModbusRtu(_, settings) = &mut profile.transport else { panic!() };
+    let _end = machine_end(&path, settings).unwrap();
+    let _other = benderd::bender::serial_port(path.to_str().unwrap(), settings).unwrap();
+    let failed = |profile: Profile| {
+        let path = path.display().to_string();
+        async move { ModbusLink::new(profile, path).unwrap().read_status().await.unwrap_err().to_string() }
+    };
+    let text = failed(profile.clone()).await;
+    assert!(text.contains("another program has it open"), "{text}");
+    drop(_other);
+    let Transport::ModbusRtu(_, settings) = &mut profile.transport else { panic!() };
+    settings.rs485 = true;
+    let text = failed(profile).await;
+    assert!(text.contains("serial.rs485 = false"), "{text}");
+    assert!(text.contains("bender: cannot connect"), "{text}");
+}
