@@ -114,12 +114,13 @@ impl Edge {
         Some(slope)
     }
 
-    /// The slopes that square cuts at known places would be found with, sought close to this one: where stripes lie nearly along
-    /// it some are drawn to theirs.
-    pub fn lured(&self, near: [f64; 2]) -> Vec<Vector2<f64>> {
-        let begin = self.push(f64::NEG_INFINITY, false, 0.0).map(|v| v.x);
-        let cuts = begin.and_then(|begin_mm| self.cuts(begin_mm)).into_iter().flatten();
-        cuts.filter_map(|cut| self.slope(cut, near)).map(|s| s.yz()).collect()
+    /// The slopes that square cuts at known places behind an edge that was found would be found with, sought close to its own: where
+    /// stripes lie nearly along it some are drawn to theirs.
+    pub fn lured(&self, edge: &Estimate) -> Vec<Vector2<f64>> {
+        let slope = edge.value.yz();
+        let behind_mm = edge.value.x + slope.norm() * self.radius_mm;
+        let cuts = self.cuts(behind_mm).into_iter().flatten();
+        cuts.filter_map(|cut| self.slope(cut, slope.into())).map(|s| s.yz()).collect()
     }
 
     /// The edge of a square cut.

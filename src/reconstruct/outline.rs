@@ -289,7 +289,7 @@ impl Rough {
         if by_points.is_none() || both.square_share > CLEARLY_SQUARE {
             return Fine { free, both };
         }
-        lure.slopes = edge.map_or_else(Vec::new, |e| e.lured(self.slope()));
+        lure.slopes = edge.map_or_else(Vec::new, |e| e.lured(&free));
         Fine { free, both: square::weigh(&free, &square, &lure) }
     }
 
