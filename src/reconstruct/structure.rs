@@ -238,7 +238,8 @@ impl Jury {
     /// Of two tubes with different numbers of bends that each find the other better, by the sections taken about them, the one
     /// that the points do, with one CLR for all bends or without.
     fn settled(&mut self, sample: &[Point3<f64>], best: Candidate, other: TubeModel) -> Candidate {
-        let mut points = Sample::new(sample.to_vec(), &best.model);
+        let sound = sample.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
+        let mut points = Sample::new(sound, &best.model);
         let mut fit = |model: &TubeModel| {
             let fits = [
                 self.fit_points(&mut points, model),
