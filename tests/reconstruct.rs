@@ -234,6 +234,24 @@ fn choices_that_once_went_wrong() {
     expect_right(Set::Thirty, &[83079, 83190, 84253]);
 }
 
+/// What a jaw leaves of an end settled a number of bends (87127), and a mitre was held against itself (88122).
+#[test]
+fn hard_choices_that_once_went_wrong() {
+    expect_right(Set::Hard, &[87127, 88122]);
+}
+
+/// A patch that was not scanned and a jaw hide the end of a bend; 4 and 7 mm before that passed for the straight behind it.
+#[test]
+fn a_bend_whose_end_is_hidden_is_refused() {
+    let folder = TempDir::new().unwrap();
+    for seed in [86110, 88085] {
+        let case = run_case(Set::Hard, seed, Known::Nothing, folder.path()).unwrap();
+        let verdict = case.judgement.verdict;
+        let says = |why: &String| why.contains("the scan stops within bend");
+        assert!(matches!(&verdict, Verdict::Refused(why) if says(why)), "{seed}: {verdict:?}");
+    }
+}
+
 /// 30 mm of a tube 22 mm thick are seen, in two pieces; the jaw hides the rest.
 #[test]
 fn too_short_a_piece_is_refused_with_what_was_seen() {

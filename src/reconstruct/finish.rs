@@ -28,6 +28,9 @@ const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 /// Share of the points that must lie on the tube.
 const LEAST_USED_SHARE: f64 = 0.5;
 
+/// A straight beyond which the tube goes on unseen is no shorter, in tube radii: or the bend before it may go on, too.
+const LEAST_STRAIGHT_RADII: f64 = 0.5;
+
 /// Where a centre line ends the tube does, within so many tube radii.
 const HIDDEN_RADII: f64 = 4.0;
 
@@ -117,7 +120,7 @@ fn finish_as_chosen(
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
     }
-    if let Some(bend) = ends_in_bend(&best.model) {
+    if let Some(bend) = ends_in_bend(&best.model, &measured) {
         return Err(ReconstructError::EndsInBend { bend });
     }
     measured.residual_median_mm = best.median_mm;
@@ -133,11 +136,14 @@ fn finish_as_chosen(
     Ok(Reconstruction { measured, spine, lra, ovality_mm, flattening_mm })
 }
 
-/// The bend, counted from 1, behind which the points show no straight.
-fn ends_in_bend(model: &TubeModel) -> Option<usize> {
+/// The bend, counted from 1, behind which the points show no straight; or too short a one where they stop before the tube does:
+/// what hides the rest has touched its points.
+fn ends_in_bend(model: &TubeModel, measured: &MeasuredTube) -> Option<usize> {
     let bends = &model.lra.bends;
-    let first = bends.first()?.length_mm < 0.0;
-    let last = model.lra.last_length_mm < 0.0;
+    let shown_mm = LEAST_STRAIGHT_RADII * model.tube_radius_mm;
+    let least_mm = |is_known: bool| if is_known { 0.0 } else { shown_mm };
+    let first = bends.first()?.length_mm < least_mm(measured.bends.first()?.length_mm.is_some());
+    let last = model.lra.last_length_mm < least_mm(measured.last_length_mm.is_some());
     if first { Some(1) } else { last.then_some(bends.len()) }
 }
 
