@@ -5,7 +5,8 @@
 use std::time::Duration;
 
 use benderd::bender::{
-    Bender, Intent, IntentLog, Job, LinkError, LogError, ModbusLink, Outcome, Profile, WordOrder, deliver,
+    Bender, Intent, IntentLog, Job, LinkError, LogError, ModbusLink, Outcome, Profile, TableId, WordOrder,
+    deliver,
 };
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::{Door, Fault, SimulatedBender};
@@ -277,4 +278,40 @@ async fn a_machine_that_is_not_there_is_not_called_without_pause() {
         matches!(error, LinkError::Resting { failures: 2, ms: 44_000..=60_000, .. }),
         "{error}: {address} was called again"
     );
+}
+
+/// A commit rests on the status read before. When the connection was lost since, it is not sent, on the next one neither.
+#[tokio::test]
+async fn a_commit_is_not_sent_on_another_connection_than_the_status_before_it() {
+    let profile = profile();
+    let bender = bender(&profile, 3, None).await;
+    let mut link = link(profile, &bender);
+    let id = TableId { revision: 1, crc: 7 };
+    let outdated = |result| matches!(result, Err(LinkError::Outdated { .. }));
+    assert!(outdated(link.commit(id).await), "no status was read yet");
+    link.read_status().await.unwrap();
+    // A call that is cancelled ends the connection.
+    assert!(tokio::time::timeout(Duration::ZERO, link.read_staging(8)).await.is_err());
+    assert!(outdated(link.commit(id).await));
+    link.read_staging(8).await.unwrap();
+    let error = link.commit(id).await.unwrap_err();
+    assert!(matches!(error, LinkError::Outdated { .. }), "connected again, not looked again: {error}");
+    assert!(error.to_string().contains("writing registers 32 to 35 was not sent"), "{error}");
+    link.read_status().await.unwrap();
+    link.commit(id).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_is_another_machine_is_left_alone_until_somebody_has_looked_after_it() {
+    let mut other = profile();
+    other.identification = 0x4F54_4845;
+    let bender = bender(&other, 3, None).await;
+    let mut link = link(profile(), &bender);
+    let error = link.read_status().await.unwrap_err().to_string();
+    assert!(error.contains("register 0 holds 0x4F544845"), "{error}");
+    let error = link.read_status().await.unwrap_err();
+    assert!(matches!(error, LinkError::Foreign { ms: 50_000..=60_000, .. }), "{error}");
+    link.reset();
+    let error = link.read_status().await.unwrap_err().to_string();
+    assert!(error.contains("register 0 holds 0x4F544845"), "asked again: {error}");
 }

@@ -280,7 +280,7 @@ async fn unusable_arguments_are_exit_2_and_reach_nobody() {
         let output =
             run(shop.folder.path(), &["push", "bracket.csv", "--bender", "quick.toml", "--on", on]).await;
         assert_eq!(code(&output), 2, "{on}: {}", stderr(&output));
-        assert!(stderr(&output).contains("HOST:PORT with a port of 1 to 65535"), "{}", stderr(&output));
+        assert!(stderr(&output).contains("host:port with a port of 1 to 65535"), "{}", stderr(&output));
     }
     for program in ["", "  ", &"x".repeat(33), "B\u{fc}gel"] {
         let output = shop.push("bracket.csv", &["--program", program]).await;

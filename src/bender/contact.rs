@@ -6,7 +6,12 @@
 //! Away ───────────────► Opening ──────► Ready ──────► Asking ───────────► Ready
 //!   ▲ not before retry    │ NotOpened     │ Closed      │ Doubted: a line keeps Silent, a stream is dropped
 //!   └─────────────────────┴───────────────┴─────────────┘
+//!   ▲ after its time, or Reset                    │ Foreign: not the machine that it should be
+//!   └──────────────────── Faulted ◄───────────────┘
 //! ```
+//!
+//! Each time that something fails a new epoch begins: what was learned of the machine before may no longer be so, and a command that
+//! rests on it is refused.
 //!
 //! Nothing is queued: what cannot be asked now is refused now, so nothing is asked later than it was meant to be. No state but
 //! `Away` and `Ready`, which wait for nothing, lasts beyond a time of its own.
@@ -22,6 +27,9 @@ pub struct Rules {
     asking_ms: u64,
     silence_ms: Option<u64>,
 }
+
+/// What is not the machine that it should be is looked at again after this long: somebody may have plugged it right.
+const FAULTED_MS: u64 = 60_000;
 
 /// Waits are shorter than doubling says by up to this share, so that many cells do not call on one machine in step.
 const JITTER: f64 = 0.25;
@@ -101,6 +109,11 @@ pub enum State {
         /// No longer.
         until_ms: u64,
     },
+    /// Something else answers than the machine. Nothing is sent to it.
+    Faulted {
+        /// No longer.
+        until_ms: u64,
+    },
 }
 
 /// What happened.
@@ -118,6 +131,10 @@ pub enum Event {
     Doubted,
     /// The other side closed the connection, or the device is gone.
     Closed,
+    /// An answer shows that this is not the machine that it should be.
+    Foreign,
+    /// Somebody has looked after it.
+    Reset,
 }
 
 /// What is to be done.
@@ -152,12 +169,13 @@ pub struct Contact {
     state: State,
     /// Since the last answer.
     failures: u32,
+    epoch: u64,
 }
 
 impl Contact {
     /// Not connected; the first attempt may be made at once. `seed` tells its waits from another's.
     pub fn new(rules: Rules, seed: u64) -> Contact {
-        Contact { rules, seed, state: State::Away { retry_ms: 0 }, failures: 0 }
+        Contact { rules, seed, state: State::Away { retry_ms: 0 }, failures: 0, epoch: 0 }
     }
 
     /// Where it stands.
@@ -170,9 +188,14 @@ impl Contact {
         self.failures
     }
 
+    /// Counts what ended: two equal ones have nothing between them that failed.
+    pub fn epoch(&self) -> u64 {
+        self.epoch
+    }
+
     /// One event in, one action out.
     pub fn on(&mut self, event: Event, now_ms: u64) -> Action {
-        use State::{Asking, Away, Opening, Ready, Silent};
+        use State::{Asking, Away, Faulted, Opening, Ready, Silent};
         self.let_pass(now_ms);
         let (state, action) = match (self.state, event) {
             (Away { retry_ms }, Event::Wanted) if now_ms < retry_ms => {
@@ -188,9 +211,15 @@ impl Contact {
                 (self.away(now_ms), Action::Drop)
             }
             // One request at a time.
-            (Opening { until_ms } | Asking { until_ms } | Silent { until_ms }, Event::Wanted) => {
-                (self.state, Action::Refuse { until_ms })
+            (
+                Opening { until_ms } | Asking { until_ms } | Silent { until_ms } | Faulted { until_ms },
+                Event::Wanted,
+            ) => (self.state, Action::Refuse { until_ms }),
+            (Ready | Asking { .. }, Event::Foreign) => {
+                self.fail();
+                (Faulted { until_ms: now_ms + FAULTED_MS }, Action::Drop)
             }
+            (Faulted { .. }, Event::Reset) => (Away { retry_ms: now_ms }, Action::Nothing),
             (Ready, Event::Wanted) => {
                 let until_ms = now_ms + self.rules.asking_ms;
                 (Asking { until_ms }, Action::Send { until_ms })
@@ -212,6 +241,7 @@ impl Contact {
         self.state = match self.state {
             State::Opening { until_ms } if now_ms >= until_ms => self.away(until_ms),
             State::Asking { until_ms } if now_ms >= until_ms => self.doubtful(until_ms).0,
+            State::Faulted { until_ms } if now_ms >= until_ms => State::Away { retry_ms: until_ms },
             other => other,
         };
         if matches!(self.state, State::Silent { until_ms } if now_ms >= until_ms) {
@@ -221,14 +251,22 @@ impl Contact {
 
     /// After an attempt that failed, or a connection that was lost.
     fn away(&mut self, now_ms: u64) -> State {
-        self.failures = self.failures.saturating_add(1);
+        self.fail();
         State::Away { retry_ms: now_ms + self.rules.wait_ms(self.failures, self.seed) }
+    }
+
+    fn fail(&mut self) {
+        self.failures = self.failures.saturating_add(1);
+        self.epoch += 1;
     }
 
     /// A reply may still come, and would be taken for that to the next request.
     fn doubtful(&mut self, now_ms: u64) -> (State, Action) {
         match self.rules.silence_ms {
-            Some(silence_ms) => (State::Silent { until_ms: now_ms + silence_ms }, Action::Nothing),
+            Some(silence_ms) => {
+                self.fail();
+                (State::Silent { until_ms: now_ms + silence_ms }, Action::Nothing)
+            }
             None => (self.away(now_ms), Action::Drop),
         }
     }
@@ -241,8 +279,16 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const EVENTS: [Event; 6] =
-        [Event::Wanted, Event::Opened, Event::NotOpened, Event::Answered, Event::Doubted, Event::Closed];
+    const EVENTS: [Event; 8] = [
+        Event::Wanted,
+        Event::Opened,
+        Event::NotOpened,
+        Event::Answered,
+        Event::Doubted,
+        Event::Closed,
+        Event::Foreign,
+        Event::Reset,
+    ];
 
     fn rules(silence_ms: Option<u64>) -> Rules {
         Rules::new((50, 1600), 2000, 300, silence_ms).unwrap()
@@ -261,6 +307,8 @@ mod tests {
             State::Asking { until_ms: 1000 },
             State::Silent { until_ms: 1500 },
             State::Silent { until_ms: 1000 },
+            State::Faulted { until_ms: 1500 },
+            State::Faulted { until_ms: 1000 },
         ];
         let mut table = String::new();
         for (kind, silence_ms) in [("a stream", None), ("a line", Some(500))] {
@@ -269,9 +317,12 @@ mod tests {
                 for event in EVENTS {
                     let mut contact = Contact { state, failures: 2, ..Contact::new(rules(silence_ms), 7) };
                     let action = contact.on(event, 1000);
-                    let (after, failures) = (contact.state, contact.failures);
-                    writeln!(table, "  {state:?} + {event:?} -> {after:?}, {action:?}, {failures} failures")
-                        .unwrap();
+                    let (after, failures, epoch) = (contact.state, contact.failures, contact.epoch);
+                    writeln!(
+                        table,
+                        "  {state:?} + {event:?} -> {after:?}, {action:?}, {failures} failures, epoch {epoch}"
+                    )
+                    .unwrap();
                 }
             }
         }
@@ -324,7 +375,7 @@ mod tests {
             seed in any::<u64>(),
         ) {
             let mut contact = Contact::new(rules(silence_ms), seed);
-            let mut now = 0;
+            let (mut now, mut epoch, mut failures) = (0, 0, 0);
             for (event, later) in events {
                 now += later;
                 let before = { let mut c = contact.clone(); c.let_pass(now); c.state() };
@@ -335,13 +386,22 @@ mod tests {
                 }
                 let ends_ms = match contact.state() {
                     State::Away { retry_ms, .. } => retry_ms,
-                    State::Opening { until_ms, .. } | State::Asking { until_ms } | State::Silent { until_ms } => until_ms,
+                    State::Opening { until_ms }
+                    | State::Asking { until_ms }
+                    | State::Silent { until_ms }
+                    | State::Faulted { until_ms } => until_ms,
                     State::Ready => now,
                 };
-                prop_assert!(ends_ms <= now + 2000.max(silence_ms.unwrap_or(0)));
+                let longest_ms = if matches!(contact.state(), State::Faulted { .. }) { FAULTED_MS } else { 2000 };
+                prop_assert!(ends_ms <= now + longest_ms.max(silence_ms.unwrap_or(0)));
+                // A new epoch begins with every failure, and with nothing else.
+                let failed = contact.failures() > failures;
+                prop_assert!(!failed || contact.epoch() > epoch, "{event} {:?}", contact.state());
+                prop_assert!(failed || contact.failures() == 0 || contact.epoch() == epoch);
+                (epoch, failures) = (contact.epoch(), contact.failures());
             }
             // Left alone for as long as the longest of its times in a row, it can be asked again.
-            let refused = matches!(contact.on(Event::Wanted, now + 10_000), Action::Refuse { .. });
+            let refused = matches!(contact.on(Event::Wanted, now + FAULTED_MS), Action::Refuse { .. });
             prop_assert!(!refused, "{:?}", contact.state());
         }
     }

@@ -35,6 +35,28 @@ pub enum LinkError {
         /// Milliseconds to the next.
         ms: u64,
     },
+    /// Something else answered than the machine.
+    #[error(
+        "{endpoint}: what answers there is not this machine (see the error before); it is left alone for another {ms} ms, or \
+         until the cell is armed anew"
+    )]
+    Foreign {
+        /// Where.
+        endpoint: String,
+        /// Milliseconds to the next look.
+        ms: u64,
+    },
+    /// What a command rests on may no longer be so.
+    #[error(
+        "{endpoint}: the connection failed after the machine's state was read; {what} was not sent, since what was read may no \
+         longer be so"
+    )]
+    Outdated {
+        /// Where.
+        endpoint: String,
+        /// What was to be done, with the address.
+        what: String,
+    },
     /// No reply in time.
     #[error(
         "{endpoint}: no answer within {ms} ms when {what}; the connection was dropped, a late answer is not used"
@@ -94,6 +116,9 @@ pub trait Bender: Send {
     /// Where it is, for people.
     fn endpoint(&self) -> &str;
 
+    /// Somebody has looked after the machine: one that was taken for another may be asked again.
+    fn reset(&mut self);
+
     /// One look at the machine.
     fn read_status(&mut self) -> impl Future<Output = Result<Status, LinkError>> + Send;
 
@@ -103,7 +128,7 @@ pub trait Bender: Send {
     /// Reads back this many bytes of the staging area.
     fn read_staging(&mut self, bytes: usize) -> impl Future<Output = Result<Vec<u8>, LinkError>> + Send;
 
-    /// Writes the commit word, once, never repeated by the link.
+    /// Writes the commit word, once, never repeated by the link; not at all when anything failed since the last status was read.
     fn commit(&mut self, id: TableId) -> impl Future<Output = Result<(), LinkError>> + Send;
 
     /// Reads status and active table.

@@ -41,6 +41,8 @@ pub struct ModbusLink {
     since: Instant,
     /// When something was last heard.
     heard: Instant,
+    /// The contact's epoch in which the status was read last.
+    seen: Option<u64>,
 }
 
 impl ModbusLink {
@@ -53,7 +55,16 @@ impl ModbusLink {
         let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), silence_ms)?;
         let contact = Contact::new(rules, u64::from(crc_of(endpoint.as_bytes())));
         let now = Instant::now();
-        Ok(ModbusLink { profile, endpoint, opener: None, connection: None, contact, since: now, heard: now })
+        Ok(ModbusLink {
+            profile,
+            endpoint,
+            opener: None,
+            connection: None,
+            contact,
+            since: now,
+            heard: now,
+            seen: None,
+        })
     }
 
     /// The same over wires that `opener` makes; the endpoint is their name.
@@ -97,10 +108,6 @@ impl ModbusLink {
 
     /// Opens the connection if need be, and lets a line be silent; until when a reply is waited for.
     async fn ready(&mut self) -> Result<Instant, LinkError> {
-        if matches!(self.contact.state(), State::Opening { .. } | State::Asking { .. }) {
-            // The last call was cancelled.
-            self.perform(Event::Doubted);
-        }
         loop {
             match self.on(Event::Wanted) {
                 Action::Send { until_ms } => return Ok(self.at(until_ms)),
@@ -110,6 +117,13 @@ impl ModbusLink {
                 }
                 _ => return Err(self.resting()),
             }
+        }
+    }
+
+    /// A call that was cancelled has left the contact waiting for its answer.
+    fn give_up_cancelled(&mut self) {
+        if matches!(self.contact.state(), State::Opening { .. } | State::Asking { .. }) {
+            self.perform(Event::Doubted);
         }
     }
 
@@ -129,15 +143,21 @@ impl ModbusLink {
 
     fn resting(&self) -> LinkError {
         let now_ms = millis(self.since.elapsed());
-        let ms = match self.contact.state() {
-            State::Away { retry_ms } => retry_ms.saturating_sub(now_ms),
-            _ => 0,
-        };
-        LinkError::Resting { endpoint: self.endpoint.clone(), failures: self.contact.failures(), ms }
+        let (endpoint, failures) = (self.endpoint.clone(), self.contact.failures());
+        match self.contact.state() {
+            State::Faulted { until_ms } => {
+                LinkError::Foreign { endpoint, ms: until_ms.saturating_sub(now_ms) }
+            }
+            State::Away { retry_ms } => {
+                LinkError::Resting { endpoint, failures, ms: retry_ms.saturating_sub(now_ms) }
+            }
+            _ => LinkError::Resting { endpoint, failures, ms: 0 },
+        }
     }
 
     /// One request and its checked reply.
     async fn call(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
+        self.give_up_cancelled();
         self.let_frame_end().await;
         let until = self.ready().await?;
         let (endpoint, what) = (self.endpoint.clone(), describe(&request));
@@ -209,10 +229,18 @@ impl Bender for ModbusLink {
         &self.endpoint
     }
 
+    fn reset(&mut self) {
+        self.perform(Event::Reset);
+    }
+
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         let (first, count) = status_span(&self.profile);
         let bytes = self.read(first, 2 * usize::from(count)).await?;
-        decode_status(&self.profile, &bytes).map_err(|why| self.nonsense(why))
+        self.seen = Some(self.contact.epoch());
+        decode_status(&self.profile, &bytes).map_err(|why| {
+            self.perform(Event::Foreign);
+            self.nonsense(why)
+        })
     }
 
     async fn write_staging(&mut self, staged: &Staged) -> Result<(), LinkError> {
@@ -233,7 +261,13 @@ impl Bender for ModbusLink {
 
     async fn commit(&mut self, id: TableId) -> Result<(), LinkError> {
         let words = words_of(&commit_image(&self.profile, id));
-        self.call(Request::WriteMultipleRegisters(self.profile.registers.commit, Cow::Owned(words))).await?;
+        let request = Request::WriteMultipleRegisters(self.profile.registers.commit, Cow::Owned(words));
+        self.give_up_cancelled();
+        if self.seen != Some(self.contact.epoch()) {
+            let what = describe(&request);
+            return Err(LinkError::Outdated { endpoint: self.endpoint.clone(), what });
+        }
+        self.call(request).await?;
         Ok(())
     }
 

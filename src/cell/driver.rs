@@ -146,7 +146,10 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
             let wake = self.cell.wake_at().map(|at| self.started + at);
             let event = tokio::select! {
                 command = commands.recv(), if !stopping => match command {
-                    Some(Command::Arm) => Event::Arm,
+                    Some(Command::Arm) => {
+                        self.ask(Ask::Reset);
+                        Event::Arm
+                    }
                     Some(Command::Disarm) => Event::Disarm,
                     None => {
                         stopping = true;

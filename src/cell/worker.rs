@@ -22,6 +22,8 @@ pub enum Ask {
     Read(Ticket),
     /// A delivery.
     Deliver(Ticket, Job),
+    /// Somebody has looked after the machine.
+    Reset,
 }
 
 /// The task's belongings.
@@ -65,6 +67,10 @@ impl<B: Bender> Worker<B> {
             let event = match ask {
                 Ask::Read(ticket) => self.read(ticket).await,
                 Ask::Deliver(ticket, job) => Event::Delivered(ticket, self.deliver(&job).await),
+                Ask::Reset => {
+                    self.bender.reset();
+                    continue;
+                }
             };
             if events.send(event).await.is_err() {
                 return;
