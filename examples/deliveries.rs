@@ -1,14 +1,15 @@
-//! Deliveries over a link that fails, in simulated time: `cargo run --release --example deliveries -- --count 10000`. Prints how they
-//! ended; exit status 1 when something that must hold did not.
+//! Deliveries over a link that fails: `cargo run --release --example deliveries -- --count 10000` in memory and simulated time, with
+//! `--real` over a pseudo terminal or a socket, in as much time as it takes. Prints how they ended; exit status 1 when something
+//! that must hold did not.
 
 #![allow(clippy::print_stdout)] // a program of its own
 
 use std::process::ExitCode;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use benderd::bender::Profile;
-use benderd::trial::deliveries::{Totals, in_memory, run};
+use benderd::bender::{Profile, Transport};
+use benderd::trial::deliveries::{Totals, in_memory, real, run};
 use clap::Parser;
 
 /// Deliveries of random tables with seeded faults.
@@ -23,6 +24,9 @@ struct Args {
     /// The first seed.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Over the transport's own pseudo terminal or socket, with short deadlines.
+    #[arg(long)]
+    real: bool,
     /// Of a thousand answers so many are damaged.
     #[arg(long, default_value_t = 100)]
     per_mille: u32,
@@ -30,20 +34,32 @@ struct Args {
 
 fn main() -> anyhow::Result<ExitCode> {
     let args = Args::parse();
-    let profile = Profile::load(&args.profile)?;
-    profile.transport.line().context("only lines can be simulated in memory so far")?;
+    let mut profile = Profile::load(&args.profile)?;
+    if args.real {
+        hurry(&mut profile);
+    } else {
+        profile.transport.line().context("only lines are simulated in memory; add --real")?;
+    }
+    let folder = tempfile::tempdir()?;
     let (mut totals, started) = (Totals::default(), Instant::now());
     for seed in args.seed..args.seed + args.count {
-        let runtime =
-            tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
-        let case =
-            runtime.block_on(async { run(seed, args.per_mille, &profile, in_memory(&profile)?).await })?;
-        totals.add(seed, case);
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let case = if args.real {
+            builder.enable_all().build()?.block_on(async {
+                let (ends, _kept) = real(&profile, &folder.path().join("line")).await?;
+                run(seed, args.per_mille, &profile, ends).await
+            })
+        } else {
+            let runtime = builder.enable_time().start_paused(true).build()?;
+            runtime.block_on(async { run(seed, args.per_mille, &profile, in_memory(&profile)?).await })
+        };
+        totals.add(seed, case?);
     }
     println!(
-        "{} deliveries over {}, seeds from {}, {} of 1000 answers damaged, {:.1} s",
+        "{} deliveries over {}{}, seeds from {}, {} of 1000 answers damaged, {:.1} s",
         args.count,
         args.profile,
+        if args.real { "" } else { " in memory" },
         args.seed,
         args.per_mille,
         started.elapsed().as_secs_f64()
@@ -53,4 +69,14 @@ fn main() -> anyhow::Result<ExitCode> {
         println!("seed {seed}: {what}");
     }
     Ok(if totals.wrong.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Deadlines of a machine that answers at once, or hundreds of lost answers would take an hour.
+fn hurry(profile: &mut Profile) {
+    profile.deadlines.request = Duration::from_millis(60);
+    profile.deadlines.settle_ms = 60;
+    profile.deadlines.confirm_ms = 1500;
+    if let Transport::ModbusRtu(line, _) | Transport::ModbusRtuOverTcp(line) = &mut profile.transport {
+        line.quiet = Duration::from_millis(60);
+    }
 }

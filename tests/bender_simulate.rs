@@ -56,7 +56,7 @@ fn push_goes_on_when_nobody_reads_what_it_says() {
     let mut push = benderd()
         .args(["push", table.to_str().unwrap(), "--bender", "reference-modbus", "--journal"])
         .arg(folder.path().join("journal.db"))
-        .args(["--on", &bender.address().to_string()])
+        .args(["--on", bender.address()])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()

@@ -146,7 +146,7 @@ async fn it_comes_up_disarmed_is_armed_by_signal_and_stops_cleanly() {
     let dir = tempfile::tempdir().unwrap();
     let (bender, mut taken) = bender().await;
     let manager = Manager::new(dir.path());
-    let path = config(dir.path(), "automatic", &bender.address().to_string());
+    let path = config(dir.path(), "automatic", bender.address());
     let mut daemon = start(dir.path(), &path, false);
     manager.until("READY=1");
     manager.until("STATUS=b1: disarmed");
@@ -171,7 +171,7 @@ async fn killed_and_started_again_it_is_disarmed_and_sends_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let (bender, mut taken) = bender().await;
     let manager = Manager::new(dir.path());
-    let path = config(dir.path(), "automatic", &bender.address().to_string());
+    let path = config(dir.path(), "automatic", bender.address());
     let mut daemon = start(dir.path(), &path, true);
     tokio::time::timeout(Duration::from_secs(60), taken.recv()).await.unwrap().unwrap();
     send("-KILL", &daemon);

@@ -13,11 +13,13 @@ use crate::config::{ConfigError, Document};
 
 /// The links that exist.
 #[derive(Debug, Clone, Copy, Deserialize)]
-#[serde(rename_all = "kebab-case")]
 pub enum RawTransport {
-    ModbusTcp,
-    ModbusRtu,
-    ModbusRtuOverTcp,
+    #[serde(rename = "modbus-tcp")]
+    Tcp,
+    #[serde(rename = "modbus-rtu")]
+    Rtu,
+    #[serde(rename = "modbus-rtu-over-tcp")]
+    RtuOverTcp,
 }
 
 #[derive(Deserialize)]
@@ -56,16 +58,16 @@ pub fn parse_transport(
         Err(doc.value_error(transport.span(), "transport", name, allowed))
     };
     match (transport.get_ref(), line, serial) {
-        (RawTransport::ModbusTcp, None, None) => Ok(Transport::ModbusTcp),
-        (RawTransport::ModbusTcp, ..) => wrong("without [line] and [serial]"),
-        (RawTransport::ModbusRtu, Some(line), Some(serial)) => {
+        (RawTransport::Tcp, None, None) => Ok(Transport::ModbusTcp),
+        (RawTransport::Tcp, ..) => wrong("without [line] and [serial]"),
+        (RawTransport::Rtu, Some(line), Some(serial)) => {
             Ok(Transport::ModbusRtu(parse_line(doc, line)?, parse_serial(doc, serial)?))
         }
-        (RawTransport::ModbusRtu, ..) => wrong("with [line] and [serial]"),
-        (RawTransport::ModbusRtuOverTcp, Some(line), None) => {
+        (RawTransport::Rtu, ..) => wrong("with [line] and [serial]"),
+        (RawTransport::RtuOverTcp, Some(line), None) => {
             Ok(Transport::ModbusRtuOverTcp(parse_line(doc, line)?))
         }
-        (RawTransport::ModbusRtuOverTcp, ..) => wrong("with [line], without [serial]"),
+        (RawTransport::RtuOverTcp, ..) => wrong("with [line], without [serial]"),
     }
 }
 

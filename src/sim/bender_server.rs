@@ -322,7 +322,7 @@ impl Shared {
             let mut faults = lock(&self.line_faults);
             let Some(faults) = faults.as_mut() else { return bytes };
             let usual_ms = faults.usual_ms();
-            match faults.next() {
+            match faults.fault() {
                 None => (bytes, usual_ms),
                 Some(fault @ ReplyFault::Late { ms }) => (faults.damage(fault, bytes), usual_ms + ms),
                 Some(fault) => (faults.damage(fault, bytes), usual_ms),

@@ -49,7 +49,7 @@ impl LineFaults {
     }
 
     /// What happens to the next answer.
-    pub fn next(&mut self) -> Option<ReplyFault> {
+    pub fn fault(&mut self) -> Option<ReplyFault> {
         if self.rng.random_range(0..1000) >= self.per_mille {
             return None;
         }

@@ -5,20 +5,23 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
+use tokio::net::TcpListener;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, crc_of, deliver,
-    encode_payload,
+    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Transport, crc_of,
+    deliver, encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::{Door, SimulatedBender};
 use crate::sim::faults::LineFaults;
+use crate::sim::pty::{Kept, machine_end};
 use crate::tube::{CommandRow, CommandTable};
 
 /// Room for bytes on a wire in memory.
@@ -103,6 +106,25 @@ pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
     };
     let link = ModbusLink::over(profile.clone(), "a line in memory", Box::new(open))?;
     Ok(Ends { door: Door::Line(Box::new(there), "a line in memory".into()), link })
+}
+
+/// The transport's own: a pseudo terminal of this name, or a socket.
+pub async fn real(profile: &Profile, terminal: &Path) -> Result<(Ends, Option<Kept>), TrialError> {
+    Ok(match &profile.transport {
+        Transport::ModbusRtu(_, settings) => {
+            let end = machine_end(terminal, settings)?;
+            let name = terminal.display().to_string();
+            let link = ModbusLink::new(profile.clone(), name.as_str())?;
+            (Ends { door: Door::Line(Box::new(end.wire), name), link }, end.kept)
+        }
+        socket => {
+            let listener = TcpListener::bind("127.0.0.1:0").await?;
+            let link = ModbusLink::new(profile.clone(), listener.local_addr()?.to_string())?;
+            let over_tcp = matches!(socket, Transport::ModbusRtuOverTcp(_));
+            let door = if over_tcp { Door::RtuOverTcp(listener) } else { Door::Tcp(listener) };
+            (Ends { door, link }, None)
+        }
+    })
 }
 
 /// One delivery; what must hold and did not.
