@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs everything that this project is tested by, part after part, from a fresh clone; stops at the first part that
 # fails. What the tests need and the machine lacks is installed, or named with the reason why its part is skipped.
-# FULL=1 adds the long runs: dependency policy, many property cases, a campaign of demos.
+# FULL=1 adds the long runs: dependency policy, many property cases, campaigns of demos and deliveries, thirty tubes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -89,6 +89,8 @@ if [ "${FULL:-0}" = 1 ]; then
     part deny deny
     part "many property cases" env PROPTEST_CASES=2000 cargo test --locked
     part "demo campaign" demo_campaign
+    part "ten thousand deliveries" cargo run --locked --release --example deliveries -- --count 10000
+    part "deliveries over a pseudo terminal" cargo run --locked --release --example deliveries -- --real --count 200
     part "thirty tubes" cargo run --locked --release --example accuracy -- thirty
 fi
 report 0

@@ -45,6 +45,38 @@ fn the_unit_verifies_without_a_word() {
     assert_eq!((printed(&output), output.status.code()), (String::new(), Some(0)));
 }
 
+/// The drop-in for serial ports beside it.
+fn with_serial_ports(dir: &Path) {
+    let folder = dir.join("benderd.service.d");
+    std::fs::create_dir(&folder).unwrap();
+    std::fs::copy(unit_file("serial.conf"), folder.join("serial.conf")).unwrap();
+}
+
+#[test]
+fn with_serial_ports_the_unit_verifies_without_a_word_too() {
+    let dir = tempfile::tempdir().unwrap();
+    let unit = unit_for_this_build(dir.path());
+    with_serial_ports(dir.path());
+    let Some(output) = tool("systemd-analyze", &["verify", "--man=no", &unit]) else { return };
+    assert_eq!((printed(&output), output.status.code()), (String::new(), Some(0)));
+    // The drop-in is read: nonsense in it is complained about.
+    let drop_in = dir.path().join("benderd.service.d/serial.conf");
+    std::fs::write(&drop_in, "[Service]\nDeviceAlow=char-ttyUSB rw\n").unwrap();
+    let output = tool("systemd-analyze", &["verify", "--man=no", &unit]).unwrap();
+    assert!(printed(&output).contains("DeviceAlow"), "{}", printed(&output));
+}
+
+#[test]
+fn the_rule_gives_one_port_to_the_daemon() {
+    let text = std::fs::read_to_string(unit_file("60-benderd.rules")).unwrap();
+    let rules: Vec<&str> = text.lines().filter(|l| !l.starts_with('#') && !l.is_empty()).collect();
+    assert_eq!(rules.len(), 1);
+    let profile = benderd::bender::Profile::load("reference-rtu").unwrap();
+    let name = profile.endpoint.strip_prefix("/dev/").unwrap();
+    assert!(rules[0].contains(&format!("SYMLINK+=\"{name}\"")), "the shipped profile's name: {name}");
+    assert!(rules[0].contains("GROUP=\"benderd\""), "the unit's group");
+}
+
 #[test]
 fn the_unit_is_exposed_by_one_and_a_half_at_most() {
     let unit = unit_file("benderd.service").display().to_string();

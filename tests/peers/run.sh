@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Independent peers against the simulated bender: after `benderd push`, pymodbus and mbpoll read its active table by
-# register address and find the values. Usage: run.sh BINARY (after install.sh)
+# register address and find the values; over a serial line (a pseudo terminal), mbpoll does. Usage: run.sh BINARY (after install.sh)
 set -euo pipefail
 binary=$(realpath "${1:?usage: run.sh BINARY}")
 here=$(cd "$(dirname "$0")" && pwd)
@@ -20,19 +20,31 @@ finish() {
 trap finish EXIT
 cd "$work"
 
-mkfifo said
-"$binary" simulate bender --on 127.0.0.1:0 --program bracket --bends 3 >said &
-bender=$!
-exec 3<said
-if ! read -r -t 20 line <&3; then
-    echo "FAILED: the simulated bender did not come up"
-    exit 1
-fi
-echo "$line"
+# start PROFILE ADDRESS: a simulated bender; its first line in $line.
+start() {
+    mkfifo "said-$1"
+    "$binary" simulate bender --profile "$1" --on "$2" --program bracket --bends 3 >"said-$1" &
+    bender=$!
+    exec 3<"said-$1"
+    if ! read -r -t 20 line <&3; then
+        echo "FAILED: the simulated bender did not come up"
+        exit 1
+    fi
+    echo "$line"
+}
+
+stop() {
+    kill "$bender"
+    wait "$bender"
+    bender=
+}
+
+start reference-modbus 127.0.0.1:0
 port=$(sed -E 's/.* listens on [0-9.]+:([0-9]+);.*/\1/' <<<"$line")
 
+# push TABLE PROFILE ADDRESS
 push() {
-    "$binary" push "$1" --bender reference-modbus --on "127.0.0.1:$port" --program bracket --journal journal.db >pushed
+    "$binary" push "$1" --bender "$2" --on "$3" --program bracket --journal journal.db >pushed
     grep '^done' pushed
 }
 
@@ -45,22 +57,30 @@ length_mm,rotation_deg,angle_deg,radius_mm
 CSV
 sed -e 's/^120.25/33.33/' -e 's/92.125/93.5/' first.csv >second.csv
 
-push first.csv
+push first.csv reference-modbus "127.0.0.1:$port"
 "$python" "$here/modbus_peer.py" "$port" first.csv bracket 1
-push second.csv
+push second.csv reference-modbus "127.0.0.1:$port"
 "$python" "$here/modbus_peer.py" "$port" second.csv bracket 2
 
-# mbpoll: last length, then length, rotation, angle of each bend, from register 2018 on.
-expected="10075 3333 0 93500 8050 -60500 181250 600000 180000 1"
-found=$(mbpoll -m tcp -p "$port" -a 1 -0 -1 -q -B -t 4:int -r 2018 -c 10 127.0.0.1 |
-    sed -nE 's/^\[[0-9]+\]:[[:space:]]+(-?[0-9]+).*/\1/p' | xargs)
-if [ "$found" != "$expected" ]; then
-    echo "FAILED mbpoll: found $found, expected $expected"
-    exit 1
-fi
-echo "ok  mbpoll reads from register 2018: $found"
+# polled NAME HOW...: mbpoll reads last length, then length, rotation, angle of each bend, from register 2018 on.
+polled() {
+    local name=$1 found expected="10075 3333 0 93500 8050 -60500 181250 600000 180000 1"
+    shift
+    found=$(mbpoll -a 1 -0 -1 -q -B -t 4:int -r 2018 -c 10 "$@" |
+        sed -nE 's/^\[[0-9]+\]:[[:space:]]+(-?[0-9]+).*/\1/p' | xargs)
+    if [ "$found" != "$expected" ]; then
+        echo "FAILED mbpoll over $name: found $found, expected $expected"
+        exit 1
+    fi
+    echo "ok  mbpoll over $name reads from register 2018: $found"
+}
 
-kill "$bender"
-wait "$bender"
-bender=
+polled TCP -m tcp -p "$port" 127.0.0.1
+stop
+
+start reference-rtu "$work/line"
+push second.csv reference-rtu "$work/line"
+polled RTU -m rtu -b 19200 -P even "$work/line"
+stop
+
 echo "peers: pymodbus and mbpoll find the pushed tables in the simulated bender's active area"
