@@ -98,3 +98,18 @@ fn a_folder_that_cannot_be_used_is_refused_by_the_check_already() {
     }
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 4, "three of ours and the configuration");
 }
+
+#[test]
+fn a_profiles_requests_are_printed() {
+    for profile in ["reference-modbus", "reference-rtu"] {
+        let output =
+            Command::cargo_bin("benderd").unwrap().args(["check", "--plan", profile]).output().unwrap();
+        assert_eq!(output.status.code(), Some(0));
+        insta::assert_snapshot!(profile, String::from_utf8(output.stdout).unwrap());
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let (code, err) = benderd(dir.path(), &["check", "--plan", "no-such-machine"]);
+    assert!(code == 2 && err.contains("reference-rtu"), "{err}");
+    let (code, err) = benderd(dir.path(), &["check"]);
+    assert!(code == 2 && err.contains("--plan"), "{err}");
+}

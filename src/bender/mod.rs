@@ -11,6 +11,7 @@
 //! driver    performs the actions on a link and a journal
 //! contact   when a link connects, asks, keeps silent: events and time in, one action out
 //! modbus    the Modbus link: TCP, RTU, RTU over TCP
+//! plan      the requests that a profile asks for
 //! line      a line under it: no old reply is taken for a new one
 //! ```
 
@@ -22,6 +23,7 @@ mod line;
 mod link;
 mod modbus;
 mod open;
+pub mod plan;
 mod profile;
 mod profile_file;
 mod profile_transport;

@@ -16,9 +16,10 @@ use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 use super::contact::{Action, Contact, Event, Rules, RulesError, State};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::open::{Connection, Opener, open};
+use super::plan;
 use super::profile::{Profile, Transport};
 use super::wire::{
-    Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image, status_span,
+    Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image,
 };
 
 /// How often a device that says "busy" is asked again.
@@ -206,10 +207,10 @@ impl ModbusLink {
         }
     }
 
-    async fn read(&mut self, address: u16, bytes: usize) -> Result<Vec<u8>, LinkError> {
-        let mut out = Vec::with_capacity(bytes);
-        for (at, count) in chunks(address, bytes / 2, self.profile.modbus.max_read_registers) {
-            let words = self.call_patiently(Request::ReadHoldingRegisters(at, count)).await?;
+    async fn read(&mut self, requests: Vec<plan::Request>) -> Result<Vec<u8>, LinkError> {
+        let mut out = Vec::new();
+        for plan::Request { address, registers, .. } in requests {
+            let words = self.call_patiently(Request::ReadHoldingRegisters(address, registers)).await?;
             out.extend(words.into_iter().flat_map(u16::to_be_bytes));
         }
         Ok(out)
@@ -234,8 +235,7 @@ impl Bender for ModbusLink {
     }
 
     async fn read_status(&mut self) -> Result<Status, LinkError> {
-        let (first, count) = status_span(&self.profile);
-        let bytes = self.read(first, 2 * usize::from(count)).await?;
+        let bytes = self.read(vec![plan::status(&self.profile)]).await?;
         self.seen = Some(self.contact.epoch());
         decode_status(&self.profile, &bytes).map_err(|why| {
             self.perform(Event::Foreign);
@@ -244,19 +244,19 @@ impl Bender for ModbusLink {
     }
 
     async fn write_staging(&mut self, staged: &Staged) -> Result<(), LinkError> {
-        let words = words_of(&staging_image(&self.profile, staged));
+        let image = staging_image(&self.profile, staged);
+        let words = words_of(&image);
         let mut rest = &words[..];
-        let staging = self.profile.registers.staging;
-        for (at, count) in chunks(staging, words.len(), self.profile.modbus.max_write_registers) {
-            let (now, later) = rest.split_at(usize::from(count));
-            self.call_patiently(Request::WriteMultipleRegisters(at, Cow::Borrowed(now))).await?;
+        for request in plan::writes(&self.profile, self.profile.registers.staging, image.len()) {
+            let (now, later) = rest.split_at(usize::from(request.registers));
+            self.call_patiently(Request::WriteMultipleRegisters(request.address, Cow::Borrowed(now))).await?;
             rest = later;
         }
         Ok(())
     }
 
     async fn read_staging(&mut self, bytes: usize) -> Result<Vec<u8>, LinkError> {
-        self.read(self.profile.registers.staging, bytes).await
+        self.read(plan::reads(&self.profile, self.profile.registers.staging, bytes)).await
     }
 
     async fn commit(&mut self, id: TableId) -> Result<(), LinkError> {
@@ -277,7 +277,7 @@ impl Bender for ModbusLink {
         if status.active.revision == 0 {
             return Ok(ActiveTable { status, payload: Vec::new() });
         }
-        let mut payload = self.read(address, header).await?;
+        let mut payload = self.read(plan::reads(&self.profile, address, header)).await?;
         let name = 2 * usize::from(self.profile.table.program_registers);
         let bends = usize::from(u16::from_be_bytes([payload[name], payload[name + 1]]));
         let most = self.profile.limits.max_bends;
@@ -286,8 +286,8 @@ impl Bender for ModbusLink {
                 self.nonsense(format!("the active table says {bends} bends, its area has room for {most}"))
             );
         }
-        let rows = address + (header / 2) as u16; // the profile's check keeps the area below 65536
-        payload.extend(self.read(rows, payload_bytes(&self.profile, bends) - header).await?);
+        let rows = payload_bytes(&self.profile, bends) - header;
+        payload.extend(self.read(plan::reads(&self.profile, plan::rows(&self.profile), rows)).await?);
         let crc = crc_of(&payload);
         if crc != status.active.crc {
             return Err(self.nonsense(format!(
@@ -297,13 +297,6 @@ impl Bender for ModbusLink {
         }
         Ok(ActiveTable { status, payload })
     }
-}
-
-/// Start and count of each request; `limit` is even and so is the distance of every 32-bit value from the
-/// start, so none is split.
-fn chunks(address: u16, registers: usize, limit: u16) -> impl Iterator<Item = (u16, u16)> {
-    let step = usize::from(limit);
-    (0..registers).step_by(step).map(move |done| (address + done as u16, step.min(registers - done) as u16))
 }
 
 fn millis(time: Duration) -> u64 {
@@ -367,15 +360,6 @@ fn name(exception: ExceptionCode) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn chunks_cover_everything_and_start_even() {
-        let list = |registers, limit| chunks(1000, registers, limit).collect::<Vec<_>>();
-        assert_eq!(list(100, 100), [(1000, 100)]);
-        assert_eq!(list(101, 100), [(1000, 100), (1100, 1)]);
-        assert_eq!(list(264, 100), [(1000, 100), (1100, 100), (1200, 64)]);
-        assert_eq!(list(0, 100), []);
-    }
 
     #[test]
     fn a_reply_of_another_length_or_place_does_not_fit() {

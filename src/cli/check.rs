@@ -1,10 +1,12 @@
-//! `benderd check`: validates everything that `run` would load; connects to nothing, makes nothing.
+//! `benderd check`: validates everything that `run` would load, or prints what a profile asks of its machine; connects to nothing,
+//! makes nothing.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
-use super::{Outcome, say};
+use super::{Outcome, plan_text, say};
+use crate::bender::Profile;
 use crate::cell::Setup;
 use crate::config::{DaemonConfig, load_daemon};
 
@@ -12,7 +14,11 @@ use crate::config::{DaemonConfig, load_daemon};
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The daemon's configuration.
-    config: PathBuf,
+    #[arg(required_unless_present = "plan", conflicts_with = "plan")]
+    config: Option<PathBuf>,
+    /// Prints the requests that a profile (a shipped one's name, or a file) asks of its machine.
+    #[arg(long, value_name = "PROFILE")]
+    plan: Option<String>,
 }
 
 /// A configuration with its cells.
@@ -37,7 +43,12 @@ pub fn load(path: &Path) -> anyhow::Result<Loaded> {
 
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let loaded = load(&args.config)?;
+    if let Some(profile) = &args.plan {
+        say(&plan_text::of(&Profile::load(profile)?));
+        return Ok(Outcome::Done);
+    }
+    let Some(config) = &args.config else { anyhow::bail!("CONFIG or --plan PROFILE is missing") };
+    let loaded = load(config)?;
     for setup in &loaded.setups {
         let id = &setup.identity;
         let mode = match id.mode {
@@ -50,6 +61,6 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         say(&format!("  scans   {}", setup.folder.folder.display()));
         setup.warnings.iter().for_each(|w| say(&format!("  warning: {w}")));
     }
-    say(&format!("{}: good", args.config.display()));
+    say(&format!("{}: good", config.display()));
     Ok(Outcome::Done)
 }
