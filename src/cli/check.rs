@@ -12,9 +12,9 @@ use crate::config::{DaemonConfig, load_daemon};
 
 /// Arguments of `benderd check`.
 #[derive(Debug, clap::Args)]
+#[group(required = true, multiple = false)]
 pub struct Args {
     /// The daemon's configuration.
-    #[arg(required_unless_present = "plan", conflicts_with = "plan")]
     config: Option<PathBuf>,
     /// Prints the requests that a profile (a shipped one's name, or a file) asks of its machine.
     #[arg(long, value_name = "PROFILE")]
