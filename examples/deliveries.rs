@@ -7,7 +7,6 @@
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
 use benderd::bender::{Profile, Transport};
 use benderd::trial::deliveries::{Totals, in_memory, real, run};
 use clap::Parser;
@@ -37,11 +36,10 @@ fn main() -> anyhow::Result<ExitCode> {
     let mut profile = Profile::load(&args.profile)?;
     if args.real {
         hurry(&mut profile);
-    } else {
-        profile.transport.line().context("only lines are simulated in memory; add --real")?;
     }
-    // Over TCP the system sees to it that what arrives is whole; trouble at the machine is left.
-    let per_mille = if profile.transport.line().is_some() { args.per_mille } else { 0 };
+    // Over a real socket the system sees to it that what arrives is whole; trouble at the machine is left.
+    let whole = args.real && profile.transport.line().is_none();
+    let per_mille = if whole { 0 } else { args.per_mille };
     let folder = tempfile::tempdir()?;
     let (mut totals, started) = (Totals::default(), Instant::now());
     for seed in args.seed..args.seed + args.count {

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, Transport, Wire};
 use benderd::sim::bender_server::Door;
+use benderd::sim::frames::{Answer, Framing, Listener, Request, encode};
 use benderd::sim::pty::machine_end;
-use benderd::sim::rtu::{Answer, Listener, Request, encode};
 use benderd::trial::deliveries::{Ending, Ends, Totals, in_memory, run};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
 use tokio::net::TcpListener;
@@ -33,13 +33,13 @@ fn link(profile: Profile, wire: DuplexStream) -> ModbusLink {
 
 /// A unit whose registers hold their own addresses. Before each answer it waits as long as the list says, then not at all.
 async fn unit(mut wire: DuplexStream, delays_ms: &[u64]) {
-    let (mut listener, mut bytes, mut delays) = (Listener::default(), [0; 256], delays_ms.iter());
+    let (mut listener, mut bytes, mut delays) = (Listener::new(Framing::Rtu), [0; 256], delays_ms.iter());
     while let Ok(count @ 1..) = wire.read(&mut bytes).await {
         let Some(heard) = listener.take(&bytes[..count]) else { continue };
         let Request::Read { address, count } = heard.request else { panic!("{heard:?}") };
         tokio::time::sleep(Duration::from_millis(*delays.next().unwrap_or(&0))).await;
         let words = (address..address + count).collect();
-        wire.write_all(&encode(&heard, &Answer::Words(words))).await.unwrap();
+        wire.write_all(&encode(Framing::Rtu, &heard, &Answer::Words(words))).await.unwrap();
     }
 }
 
@@ -129,13 +129,18 @@ async fn a_line_with_an_echo_works_when_the_profile_says_so() {
 
 /// 400 seeds with every tenth answer damaged, and trouble at the machine; `examples/deliveries` runs more.
 #[test]
-fn whatever_a_line_does_the_table_is_whole_and_the_record_true() {
-    let profile = Profile::load("reference-rtu").unwrap();
+fn whatever_a_wire_does_the_table_is_whole_and_the_record_true() {
+    for profile in ["reference-rtu", "reference-modbus"] {
+        campaign(&Profile::load(profile).unwrap());
+    }
+}
+
+fn campaign(profile: &Profile) {
     let mut totals = Totals::default();
     for seed in 1..=400 {
         let runtime =
             tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build().unwrap();
-        let case = runtime.block_on(async { run(seed, 100, &profile, in_memory(&profile).unwrap()).await });
+        let case = runtime.block_on(async { run(seed, 100, profile, in_memory(profile).unwrap()).await });
         totals.add(seed, case.unwrap());
     }
     assert!(totals.wrong.is_empty(), "{totals}: {:?}", totals.wrong);

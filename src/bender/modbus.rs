@@ -32,6 +32,9 @@ const LONGEST_WAIT_SHARE: u64 = 4;
 /// How often what a line garbled or lost is asked again.
 const LINE_RETRIES: u32 = 2;
 
+/// A constant that is wrong so many times in a row is no damage on the way: it is another machine.
+const FOREIGN_LOOKS: usize = 2;
+
 /// A bender behind Modbus.
 pub struct ModbusLink {
     profile: Profile,
@@ -235,12 +238,19 @@ impl Bender for ModbusLink {
     }
 
     async fn read_status(&mut self) -> Result<Status, LinkError> {
-        let bytes = self.read(vec![plan::status(&self.profile)]).await?;
-        self.seen = Some(self.contact.epoch());
-        decode_status(&self.profile, &bytes).map_err(|why| {
-            self.perform(Event::Foreign);
-            self.nonsense(why)
-        })
+        let mut wrong = String::new();
+        for _ in 0..FOREIGN_LOOKS {
+            let bytes = self.read(vec![plan::status(&self.profile)]).await?;
+            match decode_status(&self.profile, &bytes) {
+                Ok(status) => {
+                    self.seen = Some(self.contact.epoch());
+                    return Ok(status);
+                }
+                Err(why) => wrong = why,
+            }
+        }
+        self.perform(Event::Foreign);
+        Err(self.nonsense(wrong))
     }
 
     async fn write_staging(&mut self, staged: &Staged) -> Result<(), LinkError> {

@@ -8,8 +8,9 @@ use std::str::FromStr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, DuplexStream};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::JoinHandle;
 use tokio_modbus::server::Service;
 use tokio_modbus::server::tcp::Server;
@@ -19,7 +20,7 @@ use crate::bender::Wire;
 
 use super::bender::{MachineEvent, MachineModel, Refusal};
 use super::faults::{LineFaults, ReplyFault};
-use super::rtu::{self, Answer as RtuAnswer, Heard, Listener};
+use super::frames::{self, Framing, Heard, Listener};
 
 /// Cycle of the simulated controller's program.
 const CYCLE: Duration = Duration::from_millis(10);
@@ -114,6 +115,8 @@ pub enum Door {
     RtuOverTcp(TcpListener),
     /// RTU on a line, which people know by this name.
     Line(Box<dyn Wire>, String),
+    /// Wires in memory, one after the other.
+    Memory(Framing, UnboundedReceiver<DuplexStream>),
 }
 
 impl SimulatedBender {
@@ -130,6 +133,7 @@ impl SimulatedBender {
         let address = match &door {
             Door::Tcp(listener) | Door::RtuOverTcp(listener) => listener.local_addr()?.to_string(),
             Door::Line(_, name) => name.clone(),
+            Door::Memory(..) => "in memory".to_owned(),
         };
         let shared = Arc::new(Shared {
             model: Mutex::new(model),
@@ -152,7 +156,14 @@ impl SimulatedBender {
         let serving = match door {
             Door::Tcp(listener) => tokio::spawn(serve(listener, serving)),
             Door::RtuOverTcp(listener) => tokio::spawn(serve_lines(listener, serving)),
-            Door::Line(wire, _) => tokio::spawn(async move { serve_line(wire, &serving).await }),
+            Door::Line(wire, _) => {
+                tokio::spawn(async move { serve_wire(wire, Framing::Rtu, &serving).await })
+            }
+            Door::Memory(framing, mut wires) => tokio::spawn(async move {
+                while let Some(wire) = wires.recv().await {
+                    serve_wire(wire, framing, &serving).await;
+                }
+            }),
         };
         Ok(SimulatedBender { shared, address, tasks: [cycle, serving] })
     }
@@ -207,7 +218,7 @@ async fn serve_lines(listener: TcpListener, shared: Arc<Shared>) {
         match listener.accept().await {
             Ok((stream, _)) => {
                 let _ = stream.set_nodelay(true); // answers would only be slower without
-                serve_line(stream, &shared).await;
+                serve_wire(stream, Framing::Rtu, &shared).await;
             }
             Err(error) => {
                 tracing::error!(%error, "the simulated bender no longer takes connections");
@@ -217,9 +228,9 @@ async fn serve_lines(listener: TcpListener, shared: Arc<Shared>) {
     }
 }
 
-/// A unit on a line, until the line is closed or the machine hangs up.
-async fn serve_line(mut wire: impl AsyncRead + AsyncWrite + Unpin, shared: &Shared) {
-    let (mut listener, mut bytes) = (Listener::default(), [0; 512]);
+/// A unit on a wire, until that is closed or the machine hangs up.
+async fn serve_wire(mut wire: impl AsyncRead + AsyncWrite + Unpin, framing: Framing, shared: &Shared) {
+    let (mut listener, mut bytes) = (Listener::new(framing), [0; 512]);
     loop {
         let read = wire.read(&mut bytes);
         let read = if listener.is_amid() {
@@ -238,12 +249,12 @@ async fn serve_line(mut wire: impl AsyncRead + AsyncWrite + Unpin, shared: &Shar
         let answer = match shared.reply(heard.unit, &heard.request) {
             Reply::Silence => continue,
             Reply::HangUp => return,
-            Reply::Exception(code) => RtuAnswer::Exception(code.into()),
-            Reply::Words(words) => RtuAnswer::Words(words),
-            Reply::Written => RtuAnswer::Written,
+            Reply::Exception(code) => frames::Answer::Exception(code.into()),
+            Reply::Words(words) => frames::Answer::Words(words),
+            Reply::Written => frames::Answer::Written,
         };
         tokio::time::sleep(shared.delay()).await;
-        let arriving = shared.on_the_line(&heard, &answer).await;
+        let arriving = shared.on_the_wire(framing, &heard, &answer).await;
         if wire.write_all(&arriving).await.is_err() || wire.flush().await.is_err() {
             return;
         }
@@ -271,7 +282,7 @@ enum Reply {
 }
 
 impl Shared {
-    fn reply(&self, unit: u8, request: &rtu::Request) -> Reply {
+    fn reply(&self, unit: u8, request: &frames::Request) -> Reply {
         let mut model = lock(&self.model);
         let mut mute = lock(&self.mute);
         if *mute || self.fault == Some(Fault::Silent) {
@@ -284,10 +295,10 @@ impl Shared {
             return Reply::Silence;
         }
         match request {
-            rtu::Request::Read { address, count } => model
+            frames::Request::Read { address, count } => model
                 .read(*address, *count)
                 .map_or_else(|refusal| Reply::Exception(exception(refusal)), Reply::Words),
-            rtu::Request::Write { address, words } => {
+            frames::Request::Write { address, words } => {
                 let commits = *address == model.commit_address();
                 if commits && self.fault == Some(Fault::DropBeforeApply) {
                     return Reply::HangUp;
@@ -304,7 +315,7 @@ impl Shared {
                     _ => Reply::Written,
                 }
             }
-            rtu::Request::Other { .. } => Reply::Exception(ExceptionCode::IllegalFunction),
+            frames::Request::Other { .. } => Reply::Exception(ExceptionCode::IllegalFunction),
         }
     }
 
@@ -316,8 +327,8 @@ impl Shared {
     }
 
     /// The bytes that arrive of an answer, when they do.
-    async fn on_the_line(&self, heard: &Heard, answer: &RtuAnswer) -> Vec<u8> {
-        let bytes = rtu::encode(heard, answer);
+    async fn on_the_wire(&self, framing: Framing, heard: &Heard, answer: &frames::Answer) -> Vec<u8> {
+        let bytes = frames::encode(framing, heard, answer);
         let (arriving, ms) = {
             let mut faults = lock(&self.line_faults);
             let Some(faults) = faults.as_mut() else { return bytes };
@@ -362,16 +373,16 @@ impl Connection {
             return Err(ExceptionCode::GatewayTargetDevice);
         }
         let request = match request {
-            Request::ReadHoldingRegisters(address, count) => rtu::Request::Read { address, count },
+            Request::ReadHoldingRegisters(address, count) => frames::Request::Read { address, count },
             Request::WriteMultipleRegisters(address, words) => {
-                rtu::Request::Write { address, words: words.into_owned() }
+                frames::Request::Write { address, words: words.into_owned() }
             }
-            other => rtu::Request::Other { function: other.function_code().value() },
+            other => frames::Request::Other { function: other.function_code().value() },
         };
         let reply = self.shared.reply(slave, &request);
         Ok(match (reply, request) {
             (Reply::Words(words), _) => Some(Response::ReadHoldingRegisters(words)),
-            (Reply::Written, rtu::Request::Write { address, words }) => {
+            (Reply::Written, frames::Request::Write { address, words }) => {
                 let count = u16::try_from(words.len()).map_err(|_| ExceptionCode::IllegalDataValue)?;
                 Some(Response::WriteMultipleRegisters(address, count))
             }

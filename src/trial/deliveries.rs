@@ -12,15 +12,17 @@ use std::time::Duration;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use tokio::net::TcpListener;
+use tokio::sync::mpsc;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Transport, crc_of,
-    deliver, encode_payload,
+    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Transport, Wire,
+    crc_of, deliver, encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::{Door, SimulatedBender};
 use crate::sim::faults::LineFaults;
+use crate::sim::frames::Framing;
 use crate::sim::pty::{Kept, machine_end};
 use crate::tube::{CommandRow, CommandTable};
 
@@ -35,7 +37,7 @@ const TROUBLE_WITHIN_MS: u64 = 400;
 const TROUBLE_ONE_IN: u32 = 4;
 
 /// The longest that is waited for a machine to come back, in looks of one second.
-const LOOKS: usize = 30;
+const LOOKS: usize = 90;
 
 /// What became of one delivery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -96,16 +98,17 @@ pub struct Ends {
     pub link: ModbusLink,
 }
 
-/// A wire in memory.
+/// Wires in memory, as many as are opened.
 pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
-    let (here, there) = tokio::io::duplex(WIRE_BYTES);
-    let mut wire = Some(here);
+    let framing = if profile.transport.line().is_some() { Framing::Rtu } else { Framing::Tcp };
+    let (made, wires) = mpsc::unbounded_channel();
     let open = move || {
-        let again = || std::io::Error::other("a line in memory is opened once");
-        wire.take().map(|w| Box::new(w) as Box<dyn crate::bender::Wire>).ok_or_else(again)
+        let (here, there) = tokio::io::duplex(WIRE_BYTES);
+        made.send(there).map_err(|_| std::io::Error::other("the machine is gone"))?;
+        Ok(Box::new(here) as Box<dyn Wire>)
     };
-    let link = ModbusLink::over(profile.clone(), "a line in memory", Box::new(open))?;
-    Ok(Ends { door: Door::Line(Box::new(there), "a line in memory".into()), link })
+    let link = ModbusLink::over(profile.clone(), "a wire in memory", Box::new(open))?;
+    Ok(Ends { door: Door::Memory(framing, wires), link })
 }
 
 /// The transport's own: a pseudo terminal of this name, or a socket.
@@ -147,7 +150,8 @@ pub async fn run(
     let events = Arc::new(Mutex::new(Vec::new()));
     let told = Arc::clone(&events);
     let bender = SimulatedBender::start(ends.door, model, None, move |event| lock(&told).push(event))?;
-    let latest_ms = profile.transport.line().map_or(0, |line| line.quiet.as_millis() as u64);
+    let quiet = profile.transport.line().map_or(profile.deadlines.request, |line| line.quiet);
+    let latest_ms = quiet.as_millis() as u64;
     bender.set_line_faults(Some(LineFaults::new(seed, per_mille, latest_ms)));
     let trouble = trouble(&mut rng);
 

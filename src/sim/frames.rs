@@ -1,14 +1,29 @@
-//! Modbus RTU at the machine's end of a line: bytes to requests, answers to bytes. Pure; written from the standard
-//! (Modbus over serial line 1.02, application protocol 1.1b3), not from the client's library: the two check each other.
+//! Modbus at the machine's end of a wire, RTU's frames and TCP's: bytes to requests, answers to bytes. Pure; written from the
+//! standard (Modbus over serial line 1.02, messaging on TCP/IP 1.0b, application protocol 1.1b3), not from the client's library:
+//! the two check each other.
 
 /// Longest frame.
 const LONGEST: usize = 256;
 
-/// A request on the line, whosever it is.
+/// How a request is wrapped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Framing {
+    /// Unit, then the request, then a CRC.
+    Rtu,
+    /// A header of seven bytes with a transaction number and the length.
+    Tcp,
+}
+
+/// Bytes of TCP's header.
+const HEADER: usize = 7;
+
+/// A request on the wire, whosever it is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Heard {
     /// The unit that is asked.
     pub unit: u8,
+    /// TCP's transaction number, which the answer repeats.
+    pub transaction: u16,
     /// What for.
     pub request: Request,
 }
@@ -59,31 +74,47 @@ pub enum Answer {
 }
 
 /// The receiving side of a unit.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Listener {
+    framing: Framing,
     buffer: Vec<u8>,
 }
 
 impl Listener {
+    /// Nothing heard yet.
+    pub fn new(framing: Framing) -> Listener {
+        Listener { framing, buffer: Vec::new() }
+    }
+
     /// Takes what arrived; a request when it is complete. What is no frame waits for [`Listener::silence`].
     pub fn take(&mut self, bytes: &[u8]) -> Option<Heard> {
         self.buffer.extend(bytes);
-        let length = self.length()?;
+        let length = match self.framing {
+            Framing::Rtu => self.rtu_length()?,
+            Framing::Tcp => self.tcp_length()?,
+        };
         if self.buffer.len() < length {
             return None;
         }
         let frame: Vec<u8> = self.buffer.drain(..length).collect();
-        let (body, crc) = frame.split_at(length - 2);
-        if crc16(body).to_le_bytes() != crc {
-            self.buffer.clear();
-            return None;
+        match self.framing {
+            Framing::Tcp => parse(u16::from_be_bytes([frame[0], frame[1]]), &frame[HEADER - 1..]),
+            Framing::Rtu => {
+                let (body, crc) = frame.split_at(length - 2);
+                if crc16(body).to_le_bytes() == crc {
+                    return parse(0, body);
+                }
+                self.buffer.clear();
+                None
+            }
         }
-        parse(body)
     }
 
-    /// Nothing came for longer than a frame's gap: what is there is no frame, or one cut short.
+    /// Nothing came for longer than a frame's gap: what is there is no frame, or one cut short. TCP knows no gaps.
     pub fn silence(&mut self) {
-        self.buffer.clear();
+        if self.framing == Framing::Rtu {
+            self.buffer.clear();
+        }
     }
 
     /// Whether part of a frame is there.
@@ -92,7 +123,7 @@ impl Listener {
     }
 
     /// Length of the frame that begins here, as soon as that is known.
-    fn length(&self) -> Option<usize> {
+    fn rtu_length(&self) -> Option<usize> {
         match self.buffer.get(1)? {
             3 => Some(8),
             16 => self.buffer.get(6).map(|bytes| 9 + usize::from(*bytes)),
@@ -100,9 +131,20 @@ impl Listener {
             _ => (self.buffer.len() >= 4).then(|| self.buffer.len().min(LONGEST)),
         }
     }
+
+    /// The same over TCP; what announces an impossible length is thrown away.
+    fn tcp_length(&mut self) -> Option<usize> {
+        let announced = usize::from(u16::from_be_bytes([*self.buffer.get(4)?, *self.buffer.get(5)?]));
+        if !(2..LONGEST).contains(&announced) {
+            self.buffer.clear();
+            return None;
+        }
+        Some(HEADER - 1 + announced)
+    }
 }
 
-fn parse(body: &[u8]) -> Option<Heard> {
+/// Unit and request.
+fn parse(transaction: u16, body: &[u8]) -> Option<Heard> {
     let word = |at: usize| Some(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
     let request = match *body.get(1)? {
         3 => Request::Read { address: word(2)?, count: word(4)? },
@@ -114,11 +156,11 @@ fn parse(body: &[u8]) -> Option<Heard> {
         }
         function => Request::Other { function },
     };
-    Some(Heard { unit: body[0], request })
+    Some(Heard { unit: *body.first()?, transaction, request })
 }
 
 /// An answer as bytes.
-pub fn encode(heard: &Heard, answer: &Answer) -> Vec<u8> {
+pub fn encode(framing: Framing, heard: &Heard, answer: &Answer) -> Vec<u8> {
     let function = heard.request.function();
     let mut out = vec![heard.unit];
     match (answer, &heard.request) {
@@ -134,9 +176,18 @@ pub fn encode(heard: &Heard, answer: &Answer) -> Vec<u8> {
         (Answer::Written, _) => out.extend([function | 0x80, 4]),
         (Answer::Exception(code), _) => out.extend([function | 0x80, *code]),
     }
-    let crc = crc16(&out);
-    out.extend(crc.to_le_bytes());
-    out
+    match framing {
+        Framing::Rtu => {
+            let crc = crc16(&out);
+            out.extend(crc.to_le_bytes());
+            out
+        }
+        Framing::Tcp => {
+            let [high, low] = (out.len() as u16).to_be_bytes();
+            let [first, second] = heard.transaction.to_be_bytes();
+            [&[first, second, 0, 0, high, low], &out[..]].concat()
+        }
+    }
 }
 
 /// CRC-16 of Modbus: reflected polynomial 0xA001, start 0xFFFF.
@@ -157,16 +208,34 @@ mod tests {
     #[test]
     fn frames_written_out_by_hand() {
         assert_eq!(crc16(b"123456789"), 0x4B37, "the check value of CRC-16/MODBUS");
-        let heard = Listener::default().take(&READ).unwrap();
-        assert_eq!(heard, Heard { unit: 17, request: Request::Read { address: 107, count: 3 } });
-        let answer = encode(&heard, &Answer::Words(vec![0xAE41, 0x5652, 0x4340]));
+        let heard = Listener::new(Framing::Rtu).take(&READ).unwrap();
+        assert_eq!(
+            heard,
+            Heard { unit: 17, transaction: 0, request: Request::Read { address: 107, count: 3 } }
+        );
+        let answer = encode(Framing::Rtu, &heard, &Answer::Words(vec![0xAE41, 0x5652, 0x4340]));
         assert_eq!(answer, [0x11, 0x03, 0x06, 0xAE, 0x41, 0x56, 0x52, 0x43, 0x40, 0x49, 0xAD]);
-        assert_eq!(encode(&heard, &Answer::Exception(2))[..3], [0x11, 0x83, 2]);
+        assert_eq!(encode(Framing::Rtu, &heard, &Answer::Exception(2))[..3], [0x11, 0x83, 2]);
+    }
+
+    #[test]
+    fn the_same_over_tcp() {
+        let request = [0x12, 0x34, 0, 0, 0, 6, 0x11, 0x03, 0x00, 0x6B, 0x00, 0x03];
+        let mut listener = Listener::new(Framing::Tcp);
+        assert_eq!(listener.take(&request[..9]), None);
+        listener.silence();
+        let heard = listener.take(&request[9..]).unwrap();
+        assert_eq!(
+            heard,
+            Heard { unit: 17, transaction: 0x1234, request: Request::Read { address: 107, count: 3 } }
+        );
+        let answer = encode(Framing::Tcp, &heard, &Answer::Words(vec![0xAE41]));
+        assert_eq!(answer, [0x12, 0x34, 0, 0, 0, 5, 0x11, 0x03, 0x02, 0xAE, 0x41]);
     }
 
     #[test]
     fn a_broken_frame_is_not_answered_and_the_next_one_is() {
-        let mut listener = Listener::default();
+        let mut listener = Listener::new(Framing::Rtu);
         let mut broken = READ;
         broken[3] ^= 1;
         assert_eq!(listener.take(&broken), None);
@@ -186,17 +255,19 @@ mod tests {
             frame.extend(words.iter().flat_map(|w| w.to_be_bytes()));
             let crc = crc16(&frame);
             frame.extend(crc.to_le_bytes());
-            let mut listener = Listener::default();
+            let mut listener = Listener::new(Framing::Rtu);
             let heard: Vec<Heard> = frame.chunks(cut).filter_map(|piece| listener.take(piece)).collect();
-            prop_assert_eq!(&heard, &[Heard { unit: 1, request: Request::Write { address, words } }]);
+            prop_assert_eq!(&heard, &[Heard { unit: 1, transaction: 0, request: Request::Write { address, words } }]);
         }
 
         #[test]
         fn no_bytes_do_harm(bytes in proptest::collection::vec(any::<u8>(), 0..600), cut in 1..50_usize) {
-            let mut listener = Listener::default();
-            for piece in bytes.chunks(cut) {
-                listener.take(piece);
-                prop_assert!(listener.buffer.len() <= LONGEST + 50);
+            for framing in [Framing::Rtu, Framing::Tcp] {
+                let mut listener = Listener::new(framing);
+                for piece in bytes.chunks(cut) {
+                    listener.take(piece);
+                    prop_assert!(listener.buffer.len() <= 600);
+                }
             }
         }
     }
