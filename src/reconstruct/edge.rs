@@ -29,6 +29,8 @@ const ARCS: usize = 10;
 const BURR_TIMES: f64 = 2.0;
 /// Newton steps at most.
 const ROUNDS: usize = 15;
+/// A wedge longer than this, in steps, is no gap between two stripes.
+const LURING_STEPS: f64 = 3.0;
 /// Fewest points per step along the tube.
 const FEWEST_PER_STEP: f64 = 6.0;
 
@@ -94,18 +96,25 @@ impl Edge {
 
     /// The edge wherever the points say, close to a slope.
     pub fn free(&self, near: [f64; 2]) -> Option<Estimate> {
-        let slope = self.slope(f64::NEG_INFINITY, near)?;
+        // At 45 degrees it begins and ends a radius from where it meets the axis.
+        let slope = self.slope(f64::NEG_INFINITY, near, 2.0 * self.radius_mm)?;
         let mut found = self.sloped(&slope, EVERYWHERE).estimate(true)?;
         found.value += slope;
         Some(found)
     }
 
-    /// The slope to which the points from `from` on draw a plane that is close to it.
-    fn slope(&self, from: f64, near: [f64; 2]) -> Option<Vector3<f64>> {
+    /// How far along the tube an edge of this slope begins before it ends, where it is seen.
+    fn wedge_mm(&self, slope: &Vector2<f64>) -> f64 {
+        let along = self.points.iter().map(|p| slope.x * p[1] + slope.y * p[2]);
+        let (least, most) = along.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, m), a| (l.min(a), m.max(a)));
+        most - least
+    }
+
+    /// The slope to which the points from `from` on draw a plane that is close to it; the edge begins within `reach_mm` of the first.
+    fn slope(&self, from: f64, near: [f64; 2], reach_mm: f64) -> Option<Vector3<f64>> {
         let mut slope = Vector3::new(0.0, near[0], near[1]);
-        let first_mm = self.points.iter().find(|p| p[0] >= from)?[0];
-        // At 45 degrees it begins and ends a radius from where it meets the axis.
-        let near_mm = first_mm + 2.0 * self.radius_mm + DEPTH_STEPS * self.step_mm;
+        let first_mm = self.points.get(self.points.partition_point(|p| p[0] < from))?[0];
+        let near_mm = first_mm + reach_mm + DEPTH_STEPS * self.step_mm;
         // Coarsely first: a plane is only drawn to points that are near it.
         for soft in [0.5 * self.step_mm, 0.2 * self.step_mm, 0.0, 0.0] {
             let value = self.sloped(&slope, from..near_mm).push(f64::NEG_INFINITY, true, soft)?;
@@ -118,9 +127,14 @@ impl Edge {
     /// stripes lie nearly along it some are drawn to theirs.
     pub fn lured(&self, edge: &Estimate) -> Vec<Vector2<f64>> {
         let slope = edge.value.yz();
+        // Between two stripes there is no room for more.
+        let wedge_mm = self.wedge_mm(&slope);
+        if wedge_mm > LURING_STEPS * self.step_mm {
+            return Vec::new();
+        }
         let behind_mm = edge.value.x + slope.norm() * self.radius_mm;
         let cuts = self.cuts(behind_mm).into_iter().flatten();
-        cuts.filter_map(|cut| self.slope(cut, slope.into())).map(|s| s.yz()).collect()
+        cuts.filter_map(|cut| self.slope(cut, slope.into(), 2.0 * wedge_mm)).map(|s| s.yz()).collect()
     }
 
     /// The edge of a square cut.

@@ -36,8 +36,8 @@ const SECTOR_STEPS_SIGMA: f64 = 0.4;
 const AGREE_STEPS: f64 = 2.0;
 /// What is left of an end beside a burr is square within so many standard deviations of its slope.
 const SQUARE_SIGMAS: f64 = 2.0;
-/// An edge that is less likely square is held against what square ones look like in the pattern, one by one.
-const CLEARLY_SQUARE: f64 = 0.9;
+/// An edge that is more likely mitred is held against what square ones look like in the pattern, one by one.
+const MAYBE_SQUARE: f64 = 0.5;
 /// Sectors of less weight do not stop at the plane.
 const LEAST_WEIGHT: f64 = 0.5;
 
@@ -286,7 +286,7 @@ impl Rough {
         let [free, square] = [free, square].map(|e| Estimate { variance: e.variance + passes, ..e });
         let mut lure = Lure { scatter, slopes: Vec::new() };
         let both = square::weigh(&free, &square, &lure);
-        if by_points.is_none() || both.square_share > CLEARLY_SQUARE {
+        if by_points.is_none() || both.square_share > MAYBE_SQUARE {
             return Fine { free, both };
         }
         lure.slopes = edge.map_or_else(Vec::new, |e| e.lured(&free));
