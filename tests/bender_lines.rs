@@ -4,7 +4,7 @@
 
 use std::time::Duration;
 
-use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, Transport, Wire};
+use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, TableId, Transport, Wire};
 use benderd::sim::bender_server::Door;
 use benderd::sim::frames::{Answer, Framing, Listener, Request, encode};
 use benderd::sim::pty::machine_end;
@@ -103,6 +103,25 @@ async fn a_call_that_is_cancelled_leaves_the_line_silent_too() {
     assert!(tokio::time::timeout(Duration::from_millis(50), link.read_staging(8)).await.is_err());
     assert_eq!(words(&link.read_staging(8).await.unwrap()), [1000, 1001, 1002, 1003]);
     assert!(begun.elapsed() >= Duration::from_millis(50 + QUIET_MS), "{:?}", begun.elapsed());
+}
+
+/// Many machines serve one connection at a time: a stream that is given up is closed, and not only when the next one is opened.
+#[tokio::test(start_paused = true)]
+async fn a_stream_is_closed_when_it_is_given_up_also_when_nobody_looked_in_time() {
+    let (here, mut there) = duplex(4096);
+    let closed = tokio::spawn(async move {
+        let mut bytes = [0; 256];
+        there.read(&mut bytes).await.unwrap();
+        there.read(&mut bytes).await
+    });
+    let mut link = link(Profile::load("reference-modbus").unwrap(), here);
+    // Cancelled, and its deadline passes unseen.
+    assert!(tokio::time::timeout(Duration::from_millis(50), link.read_staging(8)).await.is_err());
+    tokio::time::advance(Duration::from_secs(2)).await;
+    let error = link.commit(TableId { revision: 1, crc: 7 }).await.unwrap_err();
+    assert!(matches!(error, LinkError::Outdated { .. }), "{error}");
+    let closed = tokio::time::timeout(Duration::from_secs(5), closed).await;
+    assert!(matches!(closed, Ok(Ok(Ok(0)))), "{closed:?}");
 }
 
 #[tokio::test(start_paused = true)]

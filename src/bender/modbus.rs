@@ -131,9 +131,10 @@ impl ModbusLink {
         }
     }
 
-    /// Tells the contact what happened, and drops the connection where it says so.
+    /// Tells the contact what happened, and drops the connection when there is none any more, by the event or by the time.
     fn perform(&mut self, event: Event) {
-        if self.on(event) == Action::Drop {
+        self.on(event);
+        if matches!(self.contact.state(), State::Away { .. } | State::Faulted { .. }) {
             self.connection = None;
         }
     }
