@@ -110,8 +110,9 @@ async fn a_call_that_is_cancelled_leaves_the_line_silent_too() {
 async fn a_stream_is_closed_when_it_is_given_up_also_when_nobody_looked_in_time() {
     let (here, mut there) = duplex(4096);
     let closed = tokio::spawn(async move {
-        let mut bytes = [0; 256];
-        there.read(&mut bytes).await.unwrap();
+        // Header, function, address, count.
+        let mut bytes = [0; 12];
+        there.read_exact(&mut bytes).await.unwrap();
         there.read(&mut bytes).await
     });
     let mut link = link(Profile::load("reference-modbus").unwrap(), here);
