@@ -37,21 +37,19 @@ fn main() -> anyhow::Result<ExitCode> {
     if args.real {
         hurry(&mut profile);
     }
-    // Over a real socket the system sees to it that what arrives is whole; trouble at the machine is left.
-    let whole = args.real && profile.transport.line().is_none();
-    let per_mille = if whole { 0 } else { args.per_mille };
     let folder = tempfile::tempdir()?;
+    let terminal = folder.path().join("line").display().to_string();
     let (mut totals, started) = (Totals::default(), Instant::now());
     for seed in args.seed..args.seed + args.count {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let case = if args.real {
             builder.enable_all().build()?.block_on(async {
-                let (ends, _kept) = real(&profile, &folder.path().join("line")).await?;
-                run(seed, per_mille, &profile, ends).await
+                let (ends, _kept) = real(&profile, &terminal).await?;
+                run(seed, args.per_mille, &profile, ends).await
             })
         } else {
             let runtime = builder.enable_time().start_paused(true).build()?;
-            runtime.block_on(async { run(seed, per_mille, &profile, in_memory(&profile)?).await })
+            runtime.block_on(async { run(seed, args.per_mille, &profile, in_memory(&profile)?).await })
         };
         totals.add(seed, case?);
     }
@@ -61,7 +59,7 @@ fn main() -> anyhow::Result<ExitCode> {
         args.profile,
         if args.real { "" } else { " in memory" },
         args.seed,
-        per_mille,
+        args.per_mille,
         started.elapsed().as_secs_f64()
     );
     println!("{totals}");

@@ -13,19 +13,14 @@ use benderd::bender::{
     decode_status, encode_payload, staging_image, status_span,
 };
 use benderd::sim::bender::{MachineEvent, MachineModel};
-use benderd::tube::{CommandRow, CommandTable};
+use benderd::tube::CommandTable;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 const BENDS: usize = 3;
 
 fn table(rng: &mut ChaCha8Rng) -> CommandTable {
-    let mut row = || CommandRow {
-        length_mm: rng.random_range(20.0..500.0),
-        rotation_rad: rng.random_range(-3.0..3.0),
-        angle_rad: rng.random_range(0.1..3.0),
-    };
-    CommandTable { bends: (0..BENDS).map(|_| row()).collect(), last_length_mm: 50.0 }
+    benderd::trial::deliveries::table(rng, BENDS)
 }
 
 fn words(bytes: &[u8]) -> Vec<u16> {

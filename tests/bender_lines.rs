@@ -5,12 +5,15 @@
 use std::time::Duration;
 
 use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, TableId, Transport, Wire};
-use benderd::sim::bender_server::Door;
-use benderd::sim::frames::{Answer, Framing, Listener, Request, encode};
+use benderd::sim::bender::MachineModel;
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+use benderd::sim::faults::{ReplyFault, WireFaults};
+use benderd::sim::frames::Framing;
 use benderd::sim::pty::machine_end;
-use benderd::trial::deliveries::{Ending, Ends, Totals, in_memory, run};
+use benderd::trial::deliveries::{Ending, Totals, in_memory, real, run};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
-use tokio::net::TcpListener;
+use tokio::sync::mpsc;
 use tokio_modbus::Slave;
 use tokio_modbus::client::{Reader as _, rtu};
 
@@ -31,16 +34,19 @@ fn link(profile: Profile, wire: DuplexStream) -> ModbusLink {
     ModbusLink::over(profile, "a line in memory", Box::new(open)).unwrap()
 }
 
-/// A unit whose registers hold their own addresses. Before each answer it waits as long as the list says, then not at all.
-async fn unit(mut wire: DuplexStream, delays_ms: &[u64]) {
-    let (mut listener, mut bytes, mut delays) = (Listener::new(Framing::Rtu), [0; 256], delays_ms.iter());
-    while let Ok(count @ 1..) = wire.read(&mut bytes).await {
-        let Some(heard) = listener.take(&bytes[..count]) else { continue };
-        let Request::Read { address, count } = heard.request else { panic!("{heard:?}") };
-        tokio::time::sleep(Duration::from_millis(*delays.next().unwrap_or(&0))).await;
-        let words = (address..address + count).collect();
-        wire.write_all(&encode(Framing::Rtu, &heard, &Answer::Words(words))).await.unwrap();
-    }
+/// A machine at the end of a wire in memory, whose staging area holds its own addresses; what happens to its answers.
+fn machine(wire: DuplexStream, faults: &[Option<ReplyFault>]) -> SimulatedBender {
+    let mut model = MachineModel::new(profile(), "P1", 3);
+    model.write(1000, &(1000..1100).collect::<Vec<u16>>()).unwrap();
+    let (tell, wires) = mpsc::unbounded_channel();
+    tell.send(wire).unwrap();
+    let bender = SimulatedBender::start(Door::Memory(Framing::Rtu, wires), model, None, |_| ()).unwrap();
+    bender.set_wire_faults(Some(WireFaults::script(faults.iter().copied())));
+    bender
+}
+
+fn late(ms: u64) -> Option<ReplyFault> {
+    Some(ReplyFault::Late { ms })
 }
 
 fn words(bytes: &[u8]) -> Vec<u16> {
@@ -52,12 +58,12 @@ fn words(bytes: &[u8]) -> Vec<u16> {
 #[tokio::test(start_paused = true)]
 async fn the_library_alone_takes_a_late_answer_for_the_next_one() {
     let (here, there) = duplex(4096);
-    tokio::spawn(async move { unit(there, &[REQUEST_MS + 100]).await });
+    let _machine = machine(there, &[late(REQUEST_MS + 100)]);
     let mut client = rtu::attach_slave(here, Slave(1));
     let first = client.read_holding_registers(1000, 4);
     assert!(tokio::time::timeout(Duration::from_millis(REQUEST_MS), first).await.is_err());
     let second = client.read_holding_registers(2000, 4).await.unwrap().unwrap();
-    assert_eq!(second, [1000, 1001, 1002, 1003], "asked were 2000 to 2003");
+    assert_eq!(second, [1000, 1001, 1002, 1003], "asked were 2000 to 2003, which are all 0");
 }
 
 /// The same line: what was late is thrown away, and the request repeated.
@@ -66,7 +72,7 @@ async fn a_late_answer_is_never_taken_for_the_next_one() {
     // Up to the last moment in which the silence lasts.
     for late_ms in [REQUEST_MS + 1, REQUEST_MS + 100, REQUEST_MS + QUIET_MS - 1] {
         let (here, there) = duplex(4096);
-        tokio::spawn(async move { unit(there, &[late_ms, 0, late_ms]).await });
+        let _machine = machine(there, &[late(late_ms), None, late(late_ms)]);
         let mut link = link(profile(), here);
         let staging = link.read_staging(24).await.unwrap();
         assert_eq!(words(&staging), (1000..1012).collect::<Vec<u16>>(), "{late_ms} ms");
@@ -97,7 +103,7 @@ async fn nothing_is_sent_before_the_silence_is_over() {
 #[tokio::test(start_paused = true)]
 async fn a_call_that_is_cancelled_leaves_the_line_silent_too() {
     let (here, there) = duplex(4096);
-    tokio::spawn(async move { unit(there, &[100]).await });
+    let _machine = machine(there, &[late(100)]);
     let mut link = link(profile(), here);
     let begun = tokio::time::Instant::now();
     assert!(tokio::time::timeout(Duration::from_millis(50), link.read_staging(8)).await.is_err());
@@ -128,10 +134,10 @@ async fn a_stream_is_closed_when_it_is_given_up_also_when_nobody_looked_in_time(
 #[tokio::test(start_paused = true)]
 async fn a_line_with_an_echo_works_when_the_profile_says_so() {
     let (here, mut line) = duplex(4096);
-    let (machine, there) = duplex(4096);
-    tokio::spawn(async move { unit(there, &[]).await });
+    let (to_and_from, there) = duplex(4096);
+    let _machine = machine(there, &[]);
     tokio::spawn(async move {
-        let (mut from_machine, mut to_machine) = tokio::io::split(machine);
+        let (mut from_machine, mut to_machine) = tokio::io::split(to_and_from);
         let (mut request, mut answer) = ([0; 256], [0; 256]);
         while let Ok(count @ 1..) = line.read(&mut request).await {
             line.write_all(&request[..count]).await.unwrap();
@@ -181,22 +187,19 @@ async fn a_table_is_delivered_through_a_pseudo_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bender");
     let profile = quick("reference-rtu");
-    let Transport::ModbusRtu(_, settings) = &profile.transport else { panic!() };
-    let end = machine_end(&path, settings).unwrap();
-    let link = ModbusLink::new(profile.clone(), path.display().to_string()).unwrap();
-    let ends = Ends { door: Door::Line(Box::new(end.wire), "a pseudo terminal".into()), link };
+    let (ends, kept) = real(&profile, &path.display().to_string()).await.unwrap();
     assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
-    drop(end.kept);
+    drop(kept);
     assert!(!path.is_symlink(), "its name is taken away");
 }
 
 #[tokio::test]
-async fn a_table_is_delivered_through_a_device_server() {
-    let profile = quick("reference-rtu-over-tcp");
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let link = ModbusLink::new(profile.clone(), listener.local_addr().unwrap().to_string()).unwrap();
-    let ends = Ends { door: Door::RtuOverTcp(listener), link };
-    assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
+async fn a_table_is_delivered_through_sockets() {
+    for profile in ["reference-rtu-over-tcp", "reference-modbus"] {
+        let profile = quick(profile);
+        let (ends, _) = real(&profile, "no terminal").await.unwrap();
+        assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
+    }
 }
 
 #[tokio::test]

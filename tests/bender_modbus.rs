@@ -9,7 +9,10 @@ use benderd::bender::{
     deliver,
 };
 use benderd::sim::bender::MachineModel;
-use benderd::sim::bender_server::{Door, Fault, SimulatedBender};
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+use benderd::sim::faults::Fault;
+use benderd::sim::frames::Framing;
 use benderd::tube::{CommandRow, CommandTable};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -54,7 +57,7 @@ fn job(bends: usize) -> Job {
 async fn bender(profile: &Profile, bends: u16, fault: Option<Fault>) -> SimulatedBender {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let model = MachineModel::new(profile.clone(), "P1", bends);
-    SimulatedBender::start(Door::Tcp(listener), model, fault, |_| ()).unwrap()
+    SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, fault, |_| ()).unwrap()
 }
 
 fn link(profile: Profile, to: &SimulatedBender) -> ModbusLink {

@@ -3,6 +3,11 @@
 use std::io::{BufRead as _, BufReader};
 use std::process::{Command, Stdio};
 
+use benderd::bender::Profile;
+use benderd::sim::bender::MachineModel;
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+
 fn benderd() -> Command {
     Command::new(assert_cmd::cargo::cargo_bin!("benderd"))
 }
@@ -38,17 +43,10 @@ fn it_says_where_it_listens_logs_commits_and_stops_on_sigterm() {
 #[test]
 fn push_goes_on_when_nobody_reads_what_it_says() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let profile = benderd::bender::Profile::load("reference-modbus").unwrap();
-    let model = benderd::sim::bender::MachineModel::new(profile, "p1", 1);
+    let profile = Profile::load("reference-modbus").unwrap();
     let bender = runtime.block_on(async {
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        benderd::sim::bender_server::SimulatedBender::start(
-            benderd::sim::bender_server::Door::Tcp(listener),
-            model,
-            None,
-            |_| (),
-        )
-        .unwrap()
+        let (door, _) = Door::open(&profile.transport, "127.0.0.1:0").await.unwrap();
+        SimulatedBender::start(door, MachineModel::new(profile, "p1", 1), None, |_| ()).unwrap()
     });
     let folder = tempfile::tempdir().unwrap();
     let table = folder.path().join("p1.csv");

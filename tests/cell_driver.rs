@@ -14,7 +14,10 @@ use benderd::config::Mode;
 use benderd::correct::{Answer, Code, Reason, Verdict};
 use benderd::journal::{Journal, Record};
 use benderd::sim::bender::MachineModel;
-use benderd::sim::bender_server::{Door, Fault, SimulatedBender};
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+use benderd::sim::faults::Fault;
+use benderd::sim::frames::Framing;
 use benderd::tube::{CommandRow, CommandTable, MeasuredTube};
 use tokio::net::TcpListener;
 use tokio::sync::{broadcast, mpsc};
@@ -67,7 +70,7 @@ async fn cell(mode: Mode, fault: Option<Fault>, verdicts: &[Verdict]) -> Cell {
     let profile = Profile::load("reference-modbus").unwrap();
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let model = MachineModel::new(profile.clone(), PROGRAM, 1);
-    let bender = SimulatedBender::start(Door::Tcp(listener), model, fault, |_| {}).unwrap();
+    let bender = SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, fault, |_| {}).unwrap();
     let settings = FolderSettings {
         poll: Duration::from_millis(5),
         settle_time: Duration::from_millis(20),
@@ -243,7 +246,7 @@ async fn an_intent_without_an_end_is_closed_by_what_the_machine_holds() {
     let profile = Profile::load("reference-modbus").unwrap();
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let model = MachineModel::new(profile.clone(), PROGRAM, 1);
-    let bender = SimulatedBender::start(Door::Tcp(listener), model, None, |_| {}).unwrap();
+    let bender = SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, None, |_| {}).unwrap();
     let identity = Identity {
         name: "b1".into(),
         program: PROGRAM.into(),
@@ -306,7 +309,7 @@ async fn a_scan_that_cannot_be_filed_away_is_not_taken_twice() {
     let profile = Profile::load("reference-modbus").unwrap();
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
     let model = MachineModel::new(profile.clone(), PROGRAM, 1);
-    let bender = SimulatedBender::start(Door::Tcp(listener), model, None, |_| {}).unwrap();
+    let bender = SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, None, |_| {}).unwrap();
     let identity =
         Identity { name: "b1".into(), program: PROGRAM.into(), mode: Mode::Observe, dwell: Dwell::default() };
     let link = ModbusLink::new(profile, bender.address().to_string()).unwrap();

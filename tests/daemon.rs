@@ -10,7 +10,9 @@ use std::time::Duration;
 use benderd::bender::Profile;
 use benderd::journal::Journal;
 use benderd::sim::bender::{MachineEvent, MachineModel};
-use benderd::sim::bender_server::{Door, SimulatedBender};
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+use benderd::sim::frames::Framing;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
@@ -135,9 +137,10 @@ async fn bender() -> (SimulatedBender, mpsc::UnboundedReceiver<MachineEvent>) {
     let profile = Profile::load("reference-modbus").unwrap();
     let model = MachineModel::new(profile, "bracket-17", 4);
     let (tell, told) = mpsc::unbounded_channel();
-    let bender =
-        SimulatedBender::start(Door::Tcp(listener), model, None, move |event| drop(tell.send(event)))
-            .unwrap();
+    let bender = SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, None, move |event| {
+        drop(tell.send(event))
+    })
+    .unwrap();
     (bender, told)
 }
 

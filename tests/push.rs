@@ -9,7 +9,10 @@ use std::process::Output;
 use assert_cmd::Command;
 use benderd::bender::Profile;
 use benderd::sim::bender::MachineModel;
-use benderd::sim::bender_server::{Door, Fault, SimulatedBender};
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
+use benderd::sim::faults::Fault;
+use benderd::sim::frames::Framing;
 use serde_json::Value;
 use tempfile::TempDir;
 use tokio::net::TcpListener;
@@ -36,7 +39,8 @@ impl Shop {
         let profile = Profile::load(profile_file.to_str().unwrap()).unwrap();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let model = MachineModel::new(profile, "bracket", 2);
-        let bender = SimulatedBender::start(Door::Tcp(listener), model, fault, |_| ()).unwrap();
+        let bender =
+            SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, fault, |_| ()).unwrap();
         Shop { folder, bender }
     }
 

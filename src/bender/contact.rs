@@ -28,11 +28,11 @@ pub struct Rules {
     silence_ms: Option<u64>,
 }
 
-/// What is not the machine that it should be is looked at again after this long: somebody may have plugged it right.
-const FAULTED_MS: u64 = 60_000;
-
 /// Waits are shorter than doubling says by up to this share, so that many cells do not call on one machine in step.
 const JITTER: f64 = 0.25;
+
+/// What is not the machine that it should be is looked at again after this long: somebody may have plugged it right.
+const FAULTED_MS: u64 = 60_000;
 
 /// Why times make no rules.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -150,8 +150,6 @@ pub enum Action {
         /// When.
         until_ms: u64,
     },
-    /// Drop the connection.
-    Drop,
     /// The request cannot be sent before.
     Refuse {
         /// When.
@@ -183,6 +181,11 @@ impl Contact {
         self.state
     }
 
+    /// Whether there is a connection to keep: one that was given up is dropped, whether an event said so or a time that is over.
+    pub fn keeps_connection(&self) -> bool {
+        !matches!(self.state, State::Away { .. } | State::Faulted { .. })
+    }
+
     /// Attempts and requests that failed since the last answer.
     pub fn failures(&self) -> u32 {
         self.failures
@@ -208,7 +211,7 @@ impl Contact {
             (Opening { .. }, Event::Opened) => (Ready, Action::Nothing),
             (Opening { .. }, Event::NotOpened | Event::Doubted)
             | (Opening { .. } | Ready | Asking { .. } | Silent { .. }, Event::Closed) => {
-                (self.away(now_ms), Action::Drop)
+                (self.away(now_ms), Action::Nothing)
             }
             // One request at a time.
             (
@@ -217,7 +220,7 @@ impl Contact {
             ) => (self.state, Action::Refuse { until_ms }),
             (Ready | Asking { .. }, Event::Foreign) => {
                 self.fail();
-                (Faulted { until_ms: now_ms + FAULTED_MS }, Action::Drop)
+                (Faulted { until_ms: now_ms + FAULTED_MS }, Action::Nothing)
             }
             (Faulted { .. }, Event::Reset) => (Away { retry_ms: now_ms }, Action::Nothing),
             (Ready, Event::Wanted) => {
@@ -228,7 +231,7 @@ impl Contact {
                 self.failures = 0;
                 (Ready, Action::Nothing)
             }
-            (Asking { .. } | Ready, Event::Doubted) => self.doubtful(now_ms),
+            (Asking { .. } | Ready, Event::Doubted) => (self.doubtful(now_ms), Action::Nothing),
             // What belongs to a connection that is no more.
             (state, _) => (state, Action::Nothing),
         };
@@ -240,7 +243,7 @@ impl Contact {
     fn let_pass(&mut self, now_ms: u64) {
         self.state = match self.state {
             State::Opening { until_ms } if now_ms >= until_ms => self.away(until_ms),
-            State::Asking { until_ms } if now_ms >= until_ms => self.doubtful(until_ms).0,
+            State::Asking { until_ms } if now_ms >= until_ms => self.doubtful(until_ms),
             State::Faulted { until_ms } if now_ms >= until_ms => State::Away { retry_ms: until_ms },
             other => other,
         };
@@ -261,13 +264,13 @@ impl Contact {
     }
 
     /// A reply may still come, and would be taken for that to the next request.
-    fn doubtful(&mut self, now_ms: u64) -> (State, Action) {
+    fn doubtful(&mut self, now_ms: u64) -> State {
         match self.rules.silence_ms {
             Some(silence_ms) => {
                 self.fail();
-                (State::Silent { until_ms: now_ms + silence_ms }, Action::Nothing)
+                State::Silent { until_ms: now_ms + silence_ms }
             }
-            None => (self.away(now_ms), Action::Drop),
+            None => self.away(now_ms),
         }
     }
 }

@@ -5,6 +5,7 @@
 //!
 //! ```text
 //! profile   what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
+//! transport which link leads there
 //! limits    the gate's figures: travel, clamp lengths, row count
 //! wire      tables to bytes and back, CRC, status word by word
 //! delivery  stage, verify, commit: events and time in, one action out
@@ -28,6 +29,7 @@ mod profile;
 mod profile_file;
 mod profile_transport;
 mod rs485;
+mod transport;
 mod wire;
 
 pub use contact::RulesError;
@@ -38,11 +40,9 @@ pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
 pub use modbus::ModbusLink;
 pub use open::{Opener, serial_port};
-pub use profile::{
-    Deadlines, Line, ModbusFormat, Parity, Profile, Registers, Serial, StateBit, TableFormat, Transport,
-    WordOrder,
-};
+pub use profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
+pub use transport::{LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{
     Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, decode_status,
     encode_payload, payload_bytes, staging_image, status_span,

@@ -10,14 +10,15 @@
 use std::borrow::Cow;
 
 use tokio::time::{Duration, Instant, sleep_until, timeout_at};
-use tokio_modbus::client::Client as _;
+use tokio_modbus::client::{Client as _, rtu};
 use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
 use super::contact::{Action, Contact, Event, Rules, RulesError, State};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::open::{Connection, Opener, open};
 use super::plan;
-use super::profile::{Profile, Transport};
+use super::profile::Profile;
+use super::transport::Transport;
 use super::wire::{
     Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image,
 };
@@ -131,10 +132,10 @@ impl ModbusLink {
         }
     }
 
-    /// Tells the contact what happened, and drops the connection when there is none any more, by the event or by the time.
+    /// Tells the contact what happened, and drops a connection that was given up.
     fn perform(&mut self, event: Event) {
         self.on(event);
-        if matches!(self.contact.state(), State::Away { .. } | State::Faulted { .. }) {
+        if !self.contact.keeps_connection() {
             self.connection = None;
         }
     }
@@ -168,8 +169,15 @@ impl ModbusLink {
         let (endpoint, what) = (self.endpoint.clone(), describe(&request));
         let broken = |what, why| LinkError::Broken { endpoint: endpoint.clone(), what, why };
         let Some(connection) = &mut self.connection else { return Err(self.resting()) };
-        let mut client = connection.client(Slave(self.profile.unit_id));
-        let answer = timeout_at(until, client.context().call(request.clone())).await;
+        let mut once;
+        let client = match connection {
+            Connection::Stream(client) => client,
+            Connection::Line(line) => {
+                once = rtu::attach_slave(line.clone(), Slave(self.profile.unit_id));
+                &mut once
+            }
+        };
+        let answer = timeout_at(until, client.call(request.clone())).await;
         self.heard = Instant::now();
         let (event, result) = match answer {
             Err(_) => {

@@ -6,12 +6,13 @@ use std::io;
 
 use tokio::net::TcpStream;
 use tokio_modbus::Slave;
-use tokio_modbus::client::{Context, rtu, tcp};
+use tokio_modbus::client::{Context, tcp};
 use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
 
 use super::line::{Line, Wire};
-use super::profile::{Parity, Profile, Serial, Transport};
+use super::profile::Profile;
 use super::rs485;
+use super::transport::{Parity, SerialSettings, Transport};
 
 /// What leads to the machine, open.
 pub enum Connection {
@@ -19,34 +20,6 @@ pub enum Connection {
     Stream(Context),
     /// A line: a new client for every request, so that nothing of the last one is left in it.
     Line(Line),
-}
-
-impl Connection {
-    /// The client for one request.
-    pub fn client(&mut self, unit: Slave) -> Client<'_> {
-        match self {
-            Connection::Stream(context) => Client::Lasting(context),
-            Connection::Line(line) => Client::Once(rtu::attach_slave(line.clone(), unit)),
-        }
-    }
-}
-
-/// A client that lasts, or one for a single request.
-pub enum Client<'a> {
-    /// The stream's.
-    Lasting(&'a mut Context),
-    /// One on the line.
-    Once(Context),
-}
-
-impl Client<'_> {
-    /// The client itself.
-    pub fn context(&mut self) -> &mut Context {
-        match self {
-            Client::Lasting(context) => context,
-            Client::Once(context) => context,
-        }
-    }
 }
 
 /// Opens a wire that is no device of this computer: one in memory.
@@ -73,7 +46,7 @@ async fn socket(endpoint: &str) -> io::Result<TcpStream> {
 }
 
 /// Opens a serial port for this process alone.
-pub fn serial_port(path: &str, settings: &Serial) -> io::Result<SerialStream> {
+pub fn serial_port(path: &str, settings: &SerialSettings) -> io::Result<SerialStream> {
     let parity = match settings.parity {
         Parity::None => tokio_serial::Parity::None,
         Parity::Even => tokio_serial::Parity::Even,

@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use crate::config::{is_device, is_host_port};
+use super::transport::Transport;
 use crate::tube::MachineLimits;
 
 /// One machine's description, validated.
@@ -37,92 +37,6 @@ pub struct Profile {
     pub limits: MachineLimits,
     /// How long to wait for what.
     pub deadlines: Deadlines,
-}
-
-/// Which link leads to the machine.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Transport {
-    /// Modbus TCP. A stream: dropped on any doubt.
-    ModbusTcp,
-    /// Modbus RTU on a serial port of this computer.
-    ModbusRtu(Line, Serial),
-    /// Modbus RTU's frames over TCP, as device servers for serial lines pass them on.
-    ModbusRtuOverTcp(Line),
-}
-
-impl Transport {
-    /// Whether an endpoint has the form that this transport takes; the machine is not looked up.
-    pub fn takes(&self, endpoint: &str) -> bool {
-        match self {
-            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => is_host_port(endpoint),
-            Transport::ModbusRtu(..) => is_device(endpoint),
-        }
-    }
-
-    /// That form in words.
-    pub fn form(&self) -> &'static str {
-        match self {
-            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => {
-                "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\""
-            }
-            Transport::ModbusRtu(..) => {
-                "the path of a serial port, best one that does not change: \"/dev/serial/by-id/...\""
-            }
-        }
-    }
-
-    /// What is known of the line, where there is one.
-    pub fn line(&self) -> Option<&Line> {
-        match self {
-            Transport::ModbusTcp => None,
-            Transport::ModbusRtu(line, _) | Transport::ModbusRtuOverTcp(line) => Some(line),
-        }
-    }
-}
-
-/// A line: it cannot be closed, so what is still under way arrives.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Line {
-    /// After so long no reply comes any more; nothing is asked for this long after a doubt.
-    pub quiet: Duration,
-    /// Whether it gives back what is sent.
-    pub echo: bool,
-}
-
-/// Settings of a serial port. Eight data bits.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Serial {
-    /// Bits per second.
-    pub baud: u32,
-    /// Parity bit.
-    pub parity: Parity,
-    /// Stop bits, 1 or 2.
-    pub stop_bits: u8,
-    /// Whether the kernel switches an RS-485 transceiver's direction.
-    pub rs485: bool,
-}
-
-impl Serial {
-    /// Silence that ends a frame: three and a half characters, 1.75 ms above 19200 baud (Modbus over serial line 1.02,
-    /// section 2.5.1.1).
-    pub fn gap(&self) -> Duration {
-        let bits = 9 + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits);
-        if self.baud > 19_200 {
-            return Duration::from_micros(1750);
-        }
-        Duration::from_secs_f64(3.5 * f64::from(bits) / f64::from(self.baud))
-    }
-}
-
-/// Parity bit of a character.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Parity {
-    /// No such bit.
-    None,
-    /// An even number of ones.
-    Even,
-    /// An odd one.
-    Odd,
 }
 
 /// Word order and request sizes of one Modbus device.

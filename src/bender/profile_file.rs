@@ -9,10 +9,9 @@ use std::time::Duration;
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::profile::{
-    Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, Transport, WordOrder,
-};
+use super::profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
 use super::profile_transport::{RawLine, RawSerial, RawTransport, parse_transport};
+use super::transport::Transport;
 use crate::config::{ConfigError, Document};
 use crate::tube::MachineLimits;
 

@@ -7,8 +7,8 @@ use std::time::Duration;
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::profile::{Line, Parity, Serial, Transport};
 use super::profile_file::integer;
+use super::transport::{LineSettings, Parity, SerialSettings, Transport};
 use crate::config::{ConfigError, Document};
 
 /// The links that exist.
@@ -33,17 +33,9 @@ pub struct RawLine {
 #[serde(deny_unknown_fields)]
 pub struct RawSerial {
     baud: Spanned<i64>,
-    parity: RawParity,
+    parity: Parity,
     stop_bits: Spanned<i64>,
     rs485: bool,
-}
-
-#[derive(Clone, Copy, Deserialize)]
-#[serde(rename_all = "lowercase")]
-enum RawParity {
-    None,
-    Even,
-    Odd,
 }
 
 /// The transport with all that it needs and nothing that it has no use for.
@@ -71,19 +63,15 @@ pub fn parse_transport(
     }
 }
 
-fn parse_line(doc: &Document, raw: &RawLine) -> Result<Line, ConfigError> {
+fn parse_line(doc: &Document, raw: &RawLine) -> Result<LineSettings, ConfigError> {
     let quiet_ms = integer(doc, &raw.quiet_ms, "line.quiet_ms", 1..=60_000)?;
-    Ok(Line { quiet: Duration::from_millis(quiet_ms as u64), echo: raw.echo })
+    Ok(LineSettings { quiet: Duration::from_millis(quiet_ms as u64), echo: raw.echo })
 }
 
-fn parse_serial(doc: &Document, raw: &RawSerial) -> Result<Serial, ConfigError> {
-    Ok(Serial {
+fn parse_serial(doc: &Document, raw: &RawSerial) -> Result<SerialSettings, ConfigError> {
+    Ok(SerialSettings {
         baud: integer(doc, &raw.baud, "serial.baud", 300..=4_000_000)? as u32,
-        parity: match raw.parity {
-            RawParity::None => Parity::None,
-            RawParity::Even => Parity::Even,
-            RawParity::Odd => Parity::Odd,
-        },
+        parity: raw.parity,
         stop_bits: integer(doc, &raw.stop_bits, "serial.stop_bits", 1..=2)? as u8,
         rs485: raw.rs485,
     })
@@ -103,8 +91,8 @@ mod tests {
     #[test]
     fn a_serial_line_is_read_with_all_its_settings() {
         let profile = parse(RTU).unwrap();
-        let line = Line { quiet: Duration::from_millis(500), echo: false };
-        let serial = Serial { baud: 19_200, parity: Parity::Even, stop_bits: 1, rs485: false };
+        let line = LineSettings { quiet: Duration::from_millis(500), echo: false };
+        let serial = SerialSettings { baud: 19_200, parity: Parity::Even, stop_bits: 1, rs485: false };
         assert_eq!(profile.transport, Transport::ModbusRtu(line, serial));
     }
 
@@ -126,14 +114,5 @@ mod tests {
         assert!(complaint("quiet_ms = 500", "quiet_ms = 0").contains("line.quiet_ms = 0"));
         assert!(complaint("\"even\"", "\"mark\"").contains("mark"));
         assert!(complaint("endpoint = \"/dev", "endpoint = \"dev").contains("path of a serial port"));
-    }
-
-    #[test]
-    fn a_frame_ends_with_three_and_a_half_characters_of_silence() {
-        let serial = |baud, parity, stop_bits| Serial { baud, parity, stop_bits, rs485: false };
-        // 11 bits a character: 3.5 x 11 / 9600.
-        assert_eq!(serial(9600, Parity::Even, 1).gap().as_micros(), 4010);
-        assert_eq!(serial(9600, Parity::None, 1).gap().as_micros(), 3645);
-        assert_eq!(serial(115_200, Parity::Even, 1).gap().as_micros(), 1750);
     }
 }

@@ -17,6 +17,7 @@
 use serde::Serialize;
 
 use super::limits::Reason;
+use super::plan::fields;
 use super::profile::{Profile, WordOrder};
 use crate::tube::{CommandRow, CommandTable};
 
@@ -191,22 +192,9 @@ pub fn commit_image(profile: &Profile, id: TableId) -> Vec<u8> {
 
 /// First address and number of registers of the status.
 pub fn status_span(profile: &Profile) -> (u16, u16) {
-    let r = &profile.registers;
-    let areas = [
-        (r.identification, 2),
-        (r.layout, 1),
-        (r.heartbeat, 1),
-        (r.state, 1),
-        (r.bend_count, 1),
-        (r.program, profile.table.program_registers),
-        (r.active_revision, 2),
-        (r.active_crc, 2),
-        (r.ack_revision, 2),
-        (r.ack_code, 1),
-        (r.commit, 4),
-    ];
-    let first = areas.iter().map(|a| a.0).min().unwrap_or(0);
-    let end = areas.iter().map(|a| u32::from(a.0) + u32::from(a.1)).max().unwrap_or(0);
+    let fields = fields(profile);
+    let first = fields.iter().map(|f| f.address).min().unwrap_or(0);
+    let end = fields.iter().map(|f| u32::from(f.address) + u32::from(f.registers)).max().unwrap_or(0);
     (first, (end - u32::from(first)) as u16)
 }
 

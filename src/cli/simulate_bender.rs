@@ -1,16 +1,14 @@
 //! `benderd simulate bender`: a bender on a socket or a serial line, until Ctrl-C or SIGTERM.
 
-use std::path::Path;
-
 use anyhow::{Context as _, bail};
-use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::{Outcome, say};
-use crate::bender::{Profile, Transport};
+use crate::bender::Profile;
 use crate::sim::bender::{MachineEvent, MachineModel};
-use crate::sim::bender_server::{Door, Fault, SimulatedBender};
-use crate::sim::pty::{Kept, machine_end};
+use crate::sim::bender_server::SimulatedBender;
+use crate::sim::door::Door;
+use crate::sim::faults::Fault;
 
 /// Arguments of `benderd simulate bender`.
 #[derive(Debug, clap::Args)]
@@ -51,7 +49,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
     let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
     let (door, _kept) =
-        open(&profile.transport, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
+        Door::open(&profile.transport, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
     let name = profile.name.clone();
     let model = MachineModel::new(profile, &args.program, args.bends);
     let bender = SimulatedBender::start(door, model, args.fault, |event| say(&describe(&event)))?;
@@ -68,18 +66,6 @@ async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
     }
     say("stopped");
     Ok(Outcome::Done)
-}
-
-/// Opens where a transport's machines are reached, and what must be kept meanwhile.
-async fn open(transport: &Transport, on: &str) -> anyhow::Result<(Door, Option<Kept>)> {
-    Ok(match transport {
-        Transport::ModbusTcp => (Door::Tcp(TcpListener::bind(on).await?), None),
-        Transport::ModbusRtuOverTcp(_) => (Door::RtuOverTcp(TcpListener::bind(on).await?), None),
-        Transport::ModbusRtu(_, settings) => {
-            let end = machine_end(Path::new(on), settings)?;
-            (Door::Line(Box::new(end.wire), on.to_owned()), end.kept)
-        }
-    })
 }
 
 fn describe(event: &MachineEvent) -> String {

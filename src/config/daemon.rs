@@ -136,7 +136,7 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
     // Which of the two the machine's profile asks for is seen when that is read.
     if !is_host_port(address) && !is_device(address) {
         let key = format!("cell {name} address");
-        let allowed = "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\", or the path of a serial port";
+        let allowed = format!("{HOST_PORT}, or the path of a serial port");
         return Err(doc.value_error(raw.address.span(), &key, format!("{address:?}"), allowed));
     }
     let settle_s = match &raw.scan.settle_s {
@@ -154,6 +154,9 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         settle_ms: (settle_s * 1000.0) as u64,
     })
 }
+
+/// The form of a network address in words.
+pub const HOST_PORT: &str = "host:port with a port of 1 to 65535, for instance \"192.168.1.20:502\"";
 
 /// Whether a text has the form `host:port` with a port of 1 to 65535; the host is not looked up.
 pub fn is_host_port(text: &str) -> bool {

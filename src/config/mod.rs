@@ -10,7 +10,7 @@ mod part;
 mod tables;
 
 pub use daemon::{
-    CellConfig, DaemonConfig, Mode, ScanUnit, is_device, is_host_port, load_daemon, parse_daemon,
+    CellConfig, DaemonConfig, HOST_PORT, Mode, ScanUnit, is_device, is_host_port, load_daemon, parse_daemon,
 };
 pub use document::{ConfigError, Document};
 pub use materials::Materials;

@@ -1,26 +1,17 @@
-//! The simulated bender on a link: Modbus TCP by tokio-modbus's server, RTU on a line by its own, with faults on demand.
+//! The simulated bender on its links: takes requests off a wire and answers them, with faults on demand.
 
-use std::future::Future;
 use std::io;
-use std::net::Shutdown;
-use std::pin::Pin;
-use std::str::FromStr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, DuplexStream};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::mpsc::UnboundedReceiver;
-use tokio::task::JoinHandle;
-use tokio_modbus::server::Service;
-use tokio_modbus::server::tcp::Server;
-use tokio_modbus::{ExceptionCode, Request, Response, SlaveRequest};
-
-use crate::bender::Wire;
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::net::TcpListener;
+use tokio::task::{JoinHandle, JoinSet};
 
 use super::bender::{MachineEvent, MachineModel, Refusal};
-use super::faults::{LineFaults, ReplyFault};
-use super::frames::{self, Framing, Heard, Listener};
+use super::door::Door;
+use super::faults::{Fault, ReplyFault, WireFaults};
+use super::frames::{self, Answer, Framing, Heard, Listener, Request};
 
 /// Cycle of the simulated controller's program.
 const CYCLE: Duration = Duration::from_millis(10);
@@ -28,76 +19,10 @@ const CYCLE: Duration = Duration::from_millis(10);
 /// Silence after which a piece of a frame is given up.
 const GIVEN_UP: Duration = Duration::from_millis(20);
 
-/// A way to misbehave.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fault {
-    /// Takes connections and answers nothing.
-    Silent,
-    /// Answers everything this much later.
-    Late {
-        /// Milliseconds.
-        ms: u64,
-    },
-    /// Has another program loaded.
-    OtherProgram,
-    /// The loaded program has one bend more.
-    OtherBends,
-    /// Is in the middle of a part.
-    Running,
-    /// Flips a bit of what is staged.
-    CorruptStaging,
-    /// Drops the connection at the commit, which is lost.
-    DropBeforeApply,
-    /// Drops the connection at the commit, which is taken.
-    DropAfterApply,
-    /// Takes the commit and answers nothing from then on.
-    SilentAfterCommit,
-    /// Answers everything with "busy".
-    Busy,
-    /// Its program stands still.
-    Frozen,
-}
-
-impl Fault {
-    /// What can be asked for, in words.
-    pub const NAMES: &str = "silent, late:MS, other-program, other-bends, running, corrupt-staging, \
-                             drop-before-apply, drop-after-apply, silent-after-commit, busy, frozen";
-
-    fn prepare(self, model: &mut MachineModel) {
-        match self {
-            Fault::OtherProgram => model.rename_program("SOMETHING-ELSE"),
-            Fault::OtherBends => model.add_bend(),
-            Fault::Running => model.set_between_parts(false),
-            Fault::CorruptStaging => model.corrupts_staging = true,
-            Fault::Frozen => model.frozen = true,
-            _ => {} // a fault of the link
-        }
-    }
-}
-
-impl FromStr for Fault {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Fault, String> {
-        if let Some(ms) = text.strip_prefix("late:") {
-            let ms = ms.parse().map_err(|_| format!("late:{ms}: milliseconds must be a whole number"))?;
-            return Ok(Fault::Late { ms });
-        }
-        match text {
-            "silent" => Ok(Fault::Silent),
-            "other-program" => Ok(Fault::OtherProgram),
-            "other-bends" => Ok(Fault::OtherBends),
-            "running" => Ok(Fault::Running),
-            "corrupt-staging" => Ok(Fault::CorruptStaging),
-            "drop-before-apply" => Ok(Fault::DropBeforeApply),
-            "drop-after-apply" => Ok(Fault::DropAfterApply),
-            "silent-after-commit" => Ok(Fault::SilentAfterCommit),
-            "busy" => Ok(Fault::Busy),
-            "frozen" => Ok(Fault::Frozen),
-            other => Err(format!("unknown fault {other:?}, known are {}", Fault::NAMES)),
-        }
-    }
-}
+/// Modbus exceptions that are no refusal of the machine's own.
+const NO_SUCH_FUNCTION: u8 = 1;
+const BUSY: u8 = 6;
+const NO_SUCH_UNIT: u8 = 11;
 
 /// A running simulated bender; stops when dropped.
 #[derive(Debug)]
@@ -105,18 +30,6 @@ pub struct SimulatedBender {
     shared: Arc<Shared>,
     address: String,
     tasks: [JoinHandle<()>; 2],
-}
-
-/// Where a simulated bender is reached.
-pub enum Door {
-    /// Modbus TCP.
-    Tcp(TcpListener),
-    /// RTU's frames over TCP.
-    RtuOverTcp(TcpListener),
-    /// RTU on a line, which people know by this name.
-    Line(Box<dyn Wire>, String),
-    /// Wires in memory, one after the other.
-    Memory(Framing, UnboundedReceiver<DuplexStream>),
 }
 
 impl SimulatedBender {
@@ -130,16 +43,12 @@ impl SimulatedBender {
         if let Some(fault) = fault {
             fault.prepare(&mut model);
         }
-        let address = match &door {
-            Door::Tcp(listener) | Door::RtuOverTcp(listener) => listener.local_addr()?.to_string(),
-            Door::Line(_, name) => name.clone(),
-            Door::Memory(..) => "in memory".to_owned(),
-        };
+        let address = door.address()?;
         let shared = Arc::new(Shared {
             model: Mutex::new(model),
             fault,
             mute: Mutex::new(false),
-            line_faults: Mutex::new(None),
+            wire_faults: Mutex::new(None),
         });
         let ticking = Arc::clone(&shared);
         let cycle = tokio::spawn(async move {
@@ -152,19 +61,7 @@ impl SimulatedBender {
                 }
             }
         });
-        let serving = Arc::clone(&shared);
-        let serving = match door {
-            Door::Tcp(listener) => tokio::spawn(serve(listener, serving)),
-            Door::RtuOverTcp(listener) => tokio::spawn(serve_lines(listener, serving)),
-            Door::Line(wire, _) => {
-                tokio::spawn(async move { serve_wire(wire, Framing::Rtu, &serving).await })
-            }
-            Door::Memory(framing, mut wires) => tokio::spawn(async move {
-                while let Some(wire) = wires.recv().await {
-                    serve_wire(wire, framing, &serving).await;
-                }
-            }),
-        };
+        let serving = tokio::spawn(serve(door, Arc::clone(&shared)));
         Ok(SimulatedBender { shared, address, tasks: [cycle, serving] })
     }
 
@@ -173,9 +70,9 @@ impl SimulatedBender {
         &self.address
     }
 
-    /// What happens to its answers on a line from now on.
-    pub fn set_line_faults(&self, faults: Option<LineFaults>) {
-        *lock(&self.shared.line_faults) = faults;
+    /// What happens to its answers on the wire from now on.
+    pub fn set_wire_faults(&self, faults: Option<WireFaults>) {
+        *lock(&self.shared.wire_faults) = faults;
     }
 
     /// Answers again after `silent-after-commit`.
@@ -195,34 +92,36 @@ impl Drop for SimulatedBender {
     }
 }
 
-async fn serve(listener: TcpListener, shared: Arc<Shared>) {
-    let on_connected = |stream: TcpStream, _peer| {
-        let shared = Arc::clone(&shared);
-        async move {
-            let _ = stream.set_nodelay(true); // answers would only be slower without
-            // A second handle on the socket, to cut it from inside a request.
-            let stream = stream.into_std()?;
-            let cut = stream.try_clone()?;
-            Ok(Some((Connection { shared, cut }, TcpStream::from_std(stream)?)))
+/// All wires that the door lets in.
+async fn serve(door: Door, shared: Arc<Shared>) {
+    match door {
+        Door::Line(wire, _) => serve_wire(wire, Framing::Rtu, &shared).await,
+        Door::Memory(framing, mut wires) => {
+            while let Some(wire) = wires.recv().await {
+                serve_wire(wire, framing, &shared).await;
+            }
         }
-    };
-    let on_error = |error: io::Error| tracing::debug!(%error, "a connection ended");
-    if let Err(error) = Server::new(listener).serve(&on_connected, on_error).await {
-        tracing::error!(%error, "the simulated bender no longer takes connections");
+        Door::Socket(framing, listener) => serve_socket(&listener, framing, &shared).await,
     }
 }
 
-/// One connection after the other: a device server has one line.
-async fn serve_lines(listener: TcpListener, shared: Arc<Shared>) {
+/// Over TCP several at once; a device server has one line, and one connection after the other.
+async fn serve_socket(listener: &TcpListener, framing: Framing, shared: &Arc<Shared>) {
+    let mut connections = JoinSet::new();
     loop {
-        match listener.accept().await {
-            Ok((stream, _)) => {
-                let _ = stream.set_nodelay(true); // answers would only be slower without
-                serve_wire(stream, Framing::Rtu, &shared).await;
-            }
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
             Err(error) => {
                 tracing::error!(%error, "the simulated bender no longer takes connections");
                 return;
+            }
+        };
+        let _ = stream.set_nodelay(true); // answers would only be slower without
+        match framing {
+            Framing::Rtu => serve_wire(stream, framing, shared).await,
+            Framing::Tcp => {
+                let shared = Arc::clone(shared);
+                connections.spawn(async move { serve_wire(stream, framing, &shared).await });
             }
         }
     }
@@ -246,12 +145,10 @@ async fn serve_wire(mut wire: impl AsyncRead + AsyncWrite + Unpin, framing: Fram
         };
         let Ok(count @ 1..) = read else { return };
         let Some(heard) = listener.take(&bytes[..count]) else { continue };
-        let answer = match shared.reply(heard.unit, &heard.request) {
+        let answer = match shared.reply(framing, &heard) {
             Reply::Silence => continue,
             Reply::HangUp => return,
-            Reply::Exception(code) => frames::Answer::Exception(code.into()),
-            Reply::Words(words) => frames::Answer::Words(words),
-            Reply::Written => frames::Answer::Written,
+            Reply::Answer(answer) => answer,
         };
         tokio::time::sleep(shared.delay()).await;
         let arriving = shared.on_the_wire(framing, &heard, &answer).await;
@@ -268,43 +165,43 @@ struct Shared {
     fault: Option<Fault>,
     /// Answers nothing any more.
     mute: Mutex<bool>,
-    line_faults: Mutex<Option<LineFaults>>,
+    wire_faults: Mutex<Option<WireFaults>>,
 }
 
-/// What a machine says to a request.
+/// What a machine does with a request.
 enum Reply {
     Silence,
-    /// The connection is cut; a line has none and is silent.
+    /// The connection is cut.
     HangUp,
-    Exception(ExceptionCode),
-    Words(Vec<u16>),
-    Written,
+    Answer(Answer),
 }
 
 impl Shared {
-    fn reply(&self, unit: u8, request: &frames::Request) -> Reply {
+    fn reply(&self, framing: Framing, heard: &Heard) -> Reply {
         let mut model = lock(&self.model);
         let mut mute = lock(&self.mute);
         if *mute || self.fault == Some(Fault::Silent) {
             return Reply::Silence;
         }
         if self.fault == Some(Fault::Busy) {
-            return Reply::Exception(ExceptionCode::ServerDeviceBusy);
+            return Reply::Answer(Answer::Exception(BUSY));
         }
-        if unit != model.unit_id() {
-            return Reply::Silence;
+        if heard.unit != model.unit_id() {
+            // On a line another unit may be meant; over TCP nobody else could answer.
+            let over_tcp = framing == Framing::Tcp;
+            return if over_tcp { Reply::Answer(Answer::Exception(NO_SUCH_UNIT)) } else { Reply::Silence };
         }
-        match request {
-            frames::Request::Read { address, count } => model
-                .read(*address, *count)
-                .map_or_else(|refusal| Reply::Exception(exception(refusal)), Reply::Words),
-            frames::Request::Write { address, words } => {
+        match &heard.request {
+            Request::Read { address, count } => Reply::Answer(
+                model.read(*address, *count).map_or_else(|r| Answer::Exception(exception(r)), Answer::Words),
+            ),
+            Request::Write { address, words } => {
                 let commits = *address == model.commit_address();
                 if commits && self.fault == Some(Fault::DropBeforeApply) {
                     return Reply::HangUp;
                 }
                 if let Err(refusal) = model.write(*address, words) {
-                    return Reply::Exception(exception(refusal));
+                    return Reply::Answer(Answer::Exception(exception(refusal)));
                 }
                 match self.fault {
                     Some(Fault::DropAfterApply) if commits => Reply::HangUp,
@@ -312,10 +209,10 @@ impl Shared {
                         *mute = true;
                         Reply::Silence
                     }
-                    _ => Reply::Written,
+                    _ => Reply::Answer(Answer::Written),
                 }
             }
-            frames::Request::Other { .. } => Reply::Exception(ExceptionCode::IllegalFunction),
+            Request::Other { .. } => Reply::Answer(Answer::Exception(NO_SUCH_FUNCTION)),
         }
     }
 
@@ -327,10 +224,10 @@ impl Shared {
     }
 
     /// The bytes that arrive of an answer, when they do.
-    async fn on_the_wire(&self, framing: Framing, heard: &Heard, answer: &frames::Answer) -> Vec<u8> {
+    async fn on_the_wire(&self, framing: Framing, heard: &Heard, answer: &Answer) -> Vec<u8> {
         let bytes = frames::encode(framing, heard, answer);
         let (arriving, ms) = {
-            let mut faults = lock(&self.line_faults);
+            let mut faults = lock(&self.wire_faults);
             let Some(faults) = faults.as_mut() else { return bytes };
             let usual_ms = faults.usual_ms();
             match faults.fault() {
@@ -344,62 +241,10 @@ impl Shared {
     }
 }
 
-struct Connection {
-    shared: Arc<Shared>,
-    cut: std::net::TcpStream,
-}
-
-type Answer = Result<Option<Response>, ExceptionCode>;
-
-impl Service for Connection {
-    type Request = SlaveRequest<'static>;
-    type Response = Option<Response>;
-    type Exception = ExceptionCode;
-    type Future = Pin<Box<dyn Future<Output = Answer> + Send>>;
-
-    fn call(&self, request: Self::Request) -> Self::Future {
-        let answer = self.answer(request);
-        let delay = self.shared.delay();
-        Box::pin(async move {
-            tokio::time::sleep(delay).await;
-            answer
-        })
-    }
-}
-
-impl Connection {
-    fn answer(&self, SlaveRequest { slave, request }: SlaveRequest<'_>) -> Answer {
-        if slave != lock(&self.shared.model).unit_id() {
-            return Err(ExceptionCode::GatewayTargetDevice);
-        }
-        let request = match request {
-            Request::ReadHoldingRegisters(address, count) => frames::Request::Read { address, count },
-            Request::WriteMultipleRegisters(address, words) => {
-                frames::Request::Write { address, words: words.into_owned() }
-            }
-            other => frames::Request::Other { function: other.function_code().value() },
-        };
-        let reply = self.shared.reply(slave, &request);
-        Ok(match (reply, request) {
-            (Reply::Words(words), _) => Some(Response::ReadHoldingRegisters(words)),
-            (Reply::Written, frames::Request::Write { address, words }) => {
-                let count = u16::try_from(words.len()).map_err(|_| ExceptionCode::IllegalDataValue)?;
-                Some(Response::WriteMultipleRegisters(address, count))
-            }
-            (Reply::Exception(code), _) => return Err(code),
-            (Reply::HangUp, _) => {
-                let _ = self.cut.shutdown(Shutdown::Both); // already closed is closed
-                None
-            }
-            (Reply::Silence | Reply::Written, _) => None,
-        })
-    }
-}
-
-fn exception(refusal: Refusal) -> ExceptionCode {
+fn exception(refusal: Refusal) -> u8 {
     match refusal {
-        Refusal::Address => ExceptionCode::IllegalDataAddress,
-        Refusal::Value => ExceptionCode::IllegalDataValue,
+        Refusal::Address => 2,
+        Refusal::Value => 3,
     }
 }
 

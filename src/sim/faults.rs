@@ -1,7 +1,85 @@
-//! What can happen to a machine's answers on a line, by chance that a seed decides.
+//! Ways in which a simulated bender misbehaves: one that is asked for, or what happens to its answers on the wire, by a script or by
+//! chance that a seed decides.
+
+use std::collections::VecDeque;
+use std::str::FromStr;
 
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
+
+use super::bender::MachineModel;
+
+/// A way to misbehave.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// Takes connections and answers nothing.
+    Silent,
+    /// Answers everything this much later.
+    Late {
+        /// Milliseconds.
+        ms: u64,
+    },
+    /// Has another program loaded.
+    OtherProgram,
+    /// The loaded program has one bend more.
+    OtherBends,
+    /// Is in the middle of a part.
+    Running,
+    /// Flips a bit of what is staged.
+    CorruptStaging,
+    /// Drops the connection at the commit, which is lost.
+    DropBeforeApply,
+    /// Drops the connection at the commit, which is taken.
+    DropAfterApply,
+    /// Takes the commit and answers nothing from then on.
+    SilentAfterCommit,
+    /// Answers everything with "busy".
+    Busy,
+    /// Its program stands still.
+    Frozen,
+}
+
+impl Fault {
+    /// What can be asked for, in words.
+    pub const NAMES: &str = "silent, late:MS, other-program, other-bends, running, corrupt-staging, \
+                             drop-before-apply, drop-after-apply, silent-after-commit, busy, frozen";
+
+    /// What it does to the machine itself.
+    pub fn prepare(self, model: &mut MachineModel) {
+        match self {
+            Fault::OtherProgram => model.rename_program("SOMETHING-ELSE"),
+            Fault::OtherBends => model.add_bend(),
+            Fault::Running => model.set_between_parts(false),
+            Fault::CorruptStaging => model.corrupts_staging = true,
+            Fault::Frozen => model.frozen = true,
+            _ => {} // a fault of the link
+        }
+    }
+}
+
+impl FromStr for Fault {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Fault, String> {
+        if let Some(ms) = text.strip_prefix("late:") {
+            let ms = ms.parse().map_err(|_| format!("late:{ms}: milliseconds must be a whole number"))?;
+            return Ok(Fault::Late { ms });
+        }
+        match text {
+            "silent" => Ok(Fault::Silent),
+            "other-program" => Ok(Fault::OtherProgram),
+            "other-bends" => Ok(Fault::OtherBends),
+            "running" => Ok(Fault::Running),
+            "corrupt-staging" => Ok(Fault::CorruptStaging),
+            "drop-before-apply" => Ok(Fault::DropBeforeApply),
+            "drop-after-apply" => Ok(Fault::DropAfterApply),
+            "silent-after-commit" => Ok(Fault::SilentAfterCommit),
+            "busy" => Ok(Fault::Busy),
+            "frozen" => Ok(Fault::Frozen),
+            other => Err(format!("unknown fault {other:?}, known are {}", Fault::NAMES)),
+        }
+    }
+}
 
 /// What happens to one answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,28 +106,40 @@ pub enum ReplyFault {
 /// An answer takes up to this long anyway.
 const USUAL_MS: u64 = 15;
 
-/// Faults by chance.
+/// What happens to the answers, one after the other.
 #[derive(Debug, Clone)]
-pub struct LineFaults {
+pub struct WireFaults {
+    /// First these, then by chance.
+    script: VecDeque<Option<ReplyFault>>,
     rng: ChaCha8Rng,
+    usual_ms: u64,
     /// Of a thousand answers.
     per_mille: u32,
     latest_ms: u64,
 }
 
-impl LineFaults {
+impl WireFaults {
     /// Of a thousand answers so many have a fault; late ones come up to `latest_ms` later.
-    pub fn new(seed: u64, per_mille: u32, latest_ms: u64) -> LineFaults {
-        LineFaults { rng: ChaCha8Rng::seed_from_u64(seed), per_mille, latest_ms }
+    pub fn new(seed: u64, per_mille: u32, latest_ms: u64) -> WireFaults {
+        let rng = ChaCha8Rng::seed_from_u64(seed);
+        WireFaults { script: VecDeque::new(), rng, usual_ms: USUAL_MS, per_mille, latest_ms }
+    }
+
+    /// These faults, and none after them.
+    pub fn script(faults: impl IntoIterator<Item = Option<ReplyFault>>) -> WireFaults {
+        WireFaults { script: faults.into_iter().collect(), usual_ms: 0, ..WireFaults::new(0, 0, 0) }
     }
 
     /// How long the next answer takes, in milliseconds.
     pub fn usual_ms(&mut self) -> u64 {
-        self.rng.random_range(1..=USUAL_MS)
+        if self.usual_ms == 0 { 0 } else { self.rng.random_range(1..=self.usual_ms) }
     }
 
     /// What happens to the next answer.
     pub fn fault(&mut self) -> Option<ReplyFault> {
+        if let Some(next) = self.script.pop_front() {
+            return next;
+        }
         if self.rng.random_range(0..1000) >= self.per_mille {
             return None;
         }

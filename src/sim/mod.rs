@@ -2,6 +2,7 @@
 
 pub mod bender;
 pub mod bender_server;
+pub mod door;
 pub mod faults;
 pub mod forming;
 pub mod frames;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use tokio_serial::{SerialPort as _, SerialStream};
 
-use crate::bender::{Serial, serial_port};
+use crate::bender::{SerialSettings, serial_port};
 
 /// The machine's end of a line, open, and what must live as long as it.
 pub struct MachineEnd {
@@ -32,7 +32,7 @@ impl Drop for Kept {
 
 /// Opens the device of this path; where there is none, makes a pseudo terminal whose other end is named so. Must be called inside
 /// a tokio runtime.
-pub fn machine_end(path: &Path, settings: &Serial) -> io::Result<MachineEnd> {
+pub fn machine_end(path: &Path, settings: &SerialSettings) -> io::Result<MachineEnd> {
     // A name that a killed simulator left behind leads nowhere.
     if path.is_symlink() && !path.exists() {
         std::fs::remove_file(path)?;

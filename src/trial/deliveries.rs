@@ -4,26 +4,25 @@
 //! Under tokio's paused clock ten thousand of them take seconds; over a real line, as long as they take.
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::fmt;
-use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
-use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Transport, Wire,
-    crc_of, deliver, encode_payload,
+    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Wire, crc_of,
+    deliver, encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
-use crate::sim::bender_server::{Door, SimulatedBender};
-use crate::sim::faults::LineFaults;
+use crate::sim::bender_server::SimulatedBender;
+use crate::sim::door::Door;
+use crate::sim::faults::WireFaults;
 use crate::sim::frames::Framing;
-use crate::sim::pty::{Kept, machine_end};
+use crate::sim::pty::Kept;
 use crate::tube::{CommandRow, CommandTable};
 
 /// Room for bytes on a wire in memory.
@@ -111,23 +110,13 @@ pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
     Ok(Ends { door: Door::Memory(framing, wires), link })
 }
 
-/// The transport's own: a pseudo terminal of this name, or a socket.
-pub async fn real(profile: &Profile, terminal: &Path) -> Result<(Ends, Option<Kept>), TrialError> {
-    Ok(match &profile.transport {
-        Transport::ModbusRtu(_, settings) => {
-            let end = machine_end(terminal, settings)?;
-            let name = terminal.display().to_string();
-            let link = ModbusLink::new(profile.clone(), name.as_str())?;
-            (Ends { door: Door::Line(Box::new(end.wire), name), link }, end.kept)
-        }
-        socket => {
-            let listener = TcpListener::bind("127.0.0.1:0").await?;
-            let link = ModbusLink::new(profile.clone(), listener.local_addr()?.to_string())?;
-            let over_tcp = matches!(socket, Transport::ModbusRtuOverTcp(_));
-            let door = if over_tcp { Door::RtuOverTcp(listener) } else { Door::Tcp(listener) };
-            (Ends { door, link }, None)
-        }
-    })
+/// The transport's own: a socket, or a pseudo terminal of this name.
+pub async fn real(profile: &Profile, terminal: &str) -> Result<(Ends, Option<Kept>), TrialError> {
+    let is_serial = profile.transport.takes(terminal);
+    let (door, kept) =
+        Door::open(&profile.transport, if is_serial { terminal } else { "127.0.0.1:0" }).await?;
+    let link = ModbusLink::new(profile.clone(), door.address()?)?;
+    Ok((Ends { door, link }, kept))
 }
 
 /// One delivery; what must hold and did not.
@@ -147,12 +136,11 @@ pub async fn run(
 
     let mut model = MachineModel::new(profile.clone(), PROGRAM, bends as u16);
     model.edit_at_screen(old.clone());
-    let events = Arc::new(Mutex::new(Vec::new()));
-    let told = Arc::clone(&events);
-    let bender = SimulatedBender::start(ends.door, model, None, move |event| lock(&told).push(event))?;
+    let (tell, told) = std::sync::mpsc::channel();
+    let bender = SimulatedBender::start(ends.door, model, None, move |event| drop(tell.send(event)))?;
     let quiet = profile.transport.line().map_or(profile.deadlines.request, |line| line.quiet);
     let latest_ms = quiet.as_millis() as u64;
-    bender.set_line_faults(Some(LineFaults::new(seed, per_mille, latest_ms)));
+    bender.set_wire_faults(Some(WireFaults::new(seed, per_mille, latest_ms)));
     let trouble = trouble(&mut rng);
 
     let (mut link, mut log) = (ends.link, Memory::default());
@@ -162,19 +150,19 @@ pub async fn run(
         let machine = async {
             tokio::time::sleep(after).await;
             bender.with(|m| trouble(m, &edited));
-            std::future::pending::<()>().await;
+            std::future::pending::<Infallible>().await
         };
         tokio::select! {
             outcome = delivery => outcome,
-            () = machine => return Ok(Err("the machine's own time ended".into())),
+            never = machine => match never {},
         }
     };
-    bender.set_line_faults(None);
+    bender.set_wire_faults(None);
     bender.with(|m| m.frozen = false);
     // What was still under way has arrived, and the machine has dealt with it.
     tokio::time::sleep(Duration::from_millis(profile.deadlines.settle_ms)).await;
     let active = bender.with(|m| (m.active(), m.active_payload()));
-    let events = lock(&events).clone();
+    let events = told.try_iter().collect();
     let found = Found { outcome, active, events, intents: log.intents, old, new, edited };
     Ok(match found.check() {
         Err(what) => Err(what),
@@ -240,8 +228,8 @@ impl Found {
     }
 }
 
-/// A table that any machine can make.
-fn table(rng: &mut ChaCha8Rng, bends: usize) -> CommandTable {
+/// A table that the reference machines can make.
+pub fn table(rng: &mut ChaCha8Rng, bends: usize) -> CommandTable {
     let mut row = || CommandRow {
         length_mm: rng.random_range(20.0..500.0),
         rotation_rad: rng.random_range(-3.0..3.0),
@@ -281,8 +269,4 @@ impl IntentLog for Memory {
     fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
         Ok(())
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

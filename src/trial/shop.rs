@@ -10,8 +10,10 @@ use super::record::PartRecord;
 use crate::bender::Profile;
 use crate::cloud::write_ply;
 use crate::sim::bender::MachineModel;
-use crate::sim::bender_server::{Door, SimulatedBender};
+use crate::sim::bender_server::SimulatedBender;
+use crate::sim::door::Door;
 use crate::sim::forming::{FormedTube, Plant};
+use crate::sim::frames::Framing;
 use crate::sim::scan::{ScanSettings, TubeShape, scan};
 use crate::tube::{CommandTable, Nominal};
 
@@ -44,7 +46,7 @@ impl Shop {
         let arcs_mm: f64 = nominal.lra.bends.iter().map(|b| b.radius_mm * b.angle_rad).sum();
         let straights_mm = nominal.lra.developed_length_mm() - arcs_mm;
         Ok(Shop {
-            bender: SimulatedBender::start(Door::Tcp(listener), model, None, |_| {})?,
+            bender: SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, None, |_| {})?,
             plant: Plant::new(nominal, seed),
             nominal: nominal.clone(),
             scan_folder: scan_folder.to_owned(),

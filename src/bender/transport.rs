@@ -1,0 +1,107 @@
+//! Which link leads to a machine, and what is known of it: addresses, line, serial port. Read from a profile's file
+//! (`profile_transport`).
+
+use std::time::Duration;
+
+use serde::Deserialize;
+
+use crate::config::{HOST_PORT, is_device, is_host_port};
+
+/// Which link leads to the machine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Transport {
+    /// Modbus TCP. A stream: dropped on any doubt.
+    ModbusTcp,
+    /// Modbus RTU on a serial port of this computer.
+    ModbusRtu(LineSettings, SerialSettings),
+    /// Modbus RTU's frames over TCP, as device servers for serial lines pass them on.
+    ModbusRtuOverTcp(LineSettings),
+}
+
+impl Transport {
+    /// Whether an endpoint has the form that this transport takes; the machine is not looked up.
+    pub fn takes(&self, endpoint: &str) -> bool {
+        match self {
+            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => is_host_port(endpoint),
+            Transport::ModbusRtu(..) => is_device(endpoint),
+        }
+    }
+
+    /// That form in words.
+    pub fn form(&self) -> &'static str {
+        match self {
+            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => HOST_PORT,
+            Transport::ModbusRtu(..) => {
+                "the path of a serial port, best one that does not change: \"/dev/serial/by-id/...\""
+            }
+        }
+    }
+
+    /// What is known of the line, where there is one.
+    pub fn line(&self) -> Option<&LineSettings> {
+        match self {
+            Transport::ModbusTcp => None,
+            Transport::ModbusRtu(line, _) | Transport::ModbusRtuOverTcp(line) => Some(line),
+        }
+    }
+}
+
+/// A line: it cannot be closed, so what is still under way arrives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LineSettings {
+    /// After so long no reply comes any more; nothing is asked for this long after a doubt.
+    pub quiet: Duration,
+    /// Whether it gives back what is sent.
+    pub echo: bool,
+}
+
+/// Settings of a serial port. Eight data bits.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SerialSettings {
+    /// Bits per second.
+    pub baud: u32,
+    /// Parity bit.
+    pub parity: Parity,
+    /// Stop bits, 1 or 2.
+    pub stop_bits: u8,
+    /// Whether the kernel switches an RS-485 transceiver's direction.
+    pub rs485: bool,
+}
+
+impl SerialSettings {
+    /// Silence that ends a frame: three and a half characters, 1.75 ms above 19200 baud (Modbus over serial line 1.02,
+    /// section 2.5.1.1).
+    pub fn gap(&self) -> Duration {
+        let bits = 9 + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits);
+        if self.baud > 19_200 {
+            return Duration::from_micros(1750);
+        }
+        Duration::from_secs_f64(3.5 * f64::from(bits) / f64::from(self.baud))
+    }
+}
+
+/// Parity bit of a character.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Parity {
+    /// No such bit.
+    None,
+    /// An even number of ones.
+    Even,
+    /// An odd one.
+    Odd,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_ends_with_three_and_a_half_characters_of_silence() {
+        let serial = |baud, parity, stop_bits| SerialSettings { baud, parity, stop_bits, rs485: false };
+        // 11 bits a character: 3.5 x 11 / 9600.
+        assert_eq!(serial(9600, Parity::Even, 1).gap().as_micros(), 4010);
+        assert_eq!(serial(9600, Parity::None, 1).gap().as_micros(), 3645);
+        assert_eq!(serial(115_200, Parity::Even, 1).gap().as_micros(), 1750);
+    }
+}
