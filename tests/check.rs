@@ -11,8 +11,9 @@ fn write_config(dir: &Path, state_dir: &str, cells: &[(&str, &str)]) {
     let part = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/parts/bracket-17.toml");
     let mut text = format!("version = 1\nstate_dir = {state_dir:?}\n");
     for (i, (address, folder)) in cells.iter().enumerate() {
+        let profile = if address.starts_with('/') { "reference-rtu" } else { "reference-modbus" };
         text += &format!(
-            "[[cell]]\nname = \"b{}\"\nmode = \"observe\"\npart = {part:?}\nprofile = \"reference-modbus\"\n\
+            "[[cell]]\nname = \"b{}\"\nmode = \"observe\"\npart = {part:?}\nprofile = {profile:?}\n\
              address = {address:?}\n[cell.scan]\nfolder = {folder:?}\n",
             i + 1
         );
@@ -97,6 +98,31 @@ fn a_folder_that_cannot_be_used_is_refused_by_the_check_already() {
         refused(dir.path(), key);
     }
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 4, "three of ours and the configuration");
+}
+
+#[test]
+fn one_serial_port_under_two_names_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let [port, link, other] = ["port", "by-id", "other"].map(|n| dir.path().join(n).display().to_string());
+    std::fs::write(&port, "").unwrap();
+    std::os::unix::fs::symlink(&port, &link).unwrap();
+    write_config(dir.path(), "state", &[(&port, "s1"), (&link, "s2")]);
+    refused(dir.path(), &format!("cell b2 address = {link:?}"));
+    write_config(dir.path(), "state", &[(&port, "s1"), (&other, "s2")]);
+    assert_eq!(benderd(dir.path(), &["check", "benderd.toml"]), (0, String::new()));
+}
+
+#[test]
+fn an_address_that_the_machines_link_has_no_use_for_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    write_config(dir.path(), "state", &[("/dev/ttyUSB0", "s1")]);
+    let file = dir.path().join("benderd.toml");
+    let text = std::fs::read_to_string(&file).unwrap().replace("reference-rtu", "reference-modbus");
+    std::fs::write(&file, text).unwrap();
+    refused(
+        dir.path(),
+        "cell b1 address = \"/dev/ttyUSB0\", allowed for profile reference-modbus is host:port",
+    );
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::net::ToSocketAddrs;
 use std::path::{Component, Path, PathBuf};
 
 use super::setup::SetupError;
-use crate::config::{CellConfig, DaemonConfig};
+use crate::config::{CellConfig, DaemonConfig, is_device};
 
 /// Refuses cells in each other's way, and folders that cannot be used by whoever asks.
 pub fn check(config: &DaemonConfig) -> Result<(), SetupError> {
@@ -59,9 +59,12 @@ fn refuse_journal_among_scans(cell: &CellConfig, state_dir: &Path) -> Result<(),
     })
 }
 
-/// Every machine that an address may mean, and the address itself: a name may be unknown while the network is
+/// Every machine that an address may mean (a serial port, whatever links lead to it), and the address itself: a name may be unknown while the network is
 /// down.
 fn machines(address: &str) -> BTreeSet<String> {
+    if is_device(address) {
+        return BTreeSet::from([real_path(Path::new(address)).display().to_string()]);
+    }
     let mut all = BTreeSet::new();
     if let Some((host, port)) = address.rsplit_once(':') {
         let host = host.to_ascii_lowercase();
