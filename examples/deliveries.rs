@@ -74,7 +74,7 @@ fn hurry(profile: &mut Profile) {
     profile.deadlines.request = Duration::from_millis(60);
     profile.deadlines.settle_ms = 60;
     profile.deadlines.confirm_ms = 1500;
-    if let Transport::ModbusRtu(line, _) | Transport::ModbusRtuOverTcp(line) = &mut profile.transport {
+    if let Transport::ModbusRtu(_, line, _) | Transport::ModbusRtuOverTcp(_, line) = &mut profile.transport {
         line.quiet = Duration::from_millis(60);
     }
 }

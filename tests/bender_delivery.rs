@@ -65,7 +65,12 @@ impl World {
         if rng.random_bool(0.5) {
             // The refusal of an earlier attempt at the next revision still stands in the acknowledgement.
             let id = TableId { revision: machine.active().revision + 1, crc: 0 };
-            machine.write(profile.registers.commit, &words(&commit_image(&profile, id))).unwrap();
+            machine
+                .write(
+                    profile.transport.modbus().unwrap().registers.commit,
+                    &words(&commit_image(&profile, id)),
+                )
+                .unwrap();
             assert!(matches!(machine.tick(), Some(MachineEvent::Refused { .. })));
         }
         let job = Job { program: "P1".into(), table: table(&mut rng), expected_active: None };
@@ -108,7 +113,9 @@ impl World {
 
     fn write_commit(&mut self, id: TableId) {
         let image = commit_image(&self.profile, id);
-        self.machine.write(self.profile.registers.commit, &words(&image)).unwrap();
+        self.machine
+            .write(self.profile.transport.modbus().unwrap().registers.commit, &words(&image))
+            .unwrap();
     }
 
     fn trouble_at_the_machine(&mut self) {
@@ -132,8 +139,13 @@ impl World {
     }
 
     fn status(&self) -> Status {
-        let (first, count) = status_span(&self.profile);
-        decode_status(&self.profile, &self.read(first, 2 * usize::from(count))).unwrap()
+        let (first, count) = status_span(&self.profile, self.profile.transport.modbus().unwrap());
+        decode_status(
+            &self.profile,
+            self.profile.transport.modbus().unwrap(),
+            &self.read(first, 2 * usize::from(count)),
+        )
+        .unwrap()
     }
 
     /// Performs an action, with or without trouble, and checks that it was allowed.
@@ -187,12 +199,14 @@ impl World {
                     let at = self.rng.random_range(0..image.len());
                     image[at] ^= 1 << self.rng.random_range(0..16);
                 }
-                self.machine.write(self.profile.registers.staging, &image).unwrap();
+                self.machine
+                    .write(self.profile.transport.modbus().unwrap().registers.staging, &image)
+                    .unwrap();
                 self.meant.insert(staged.id, staged.payload.clone());
                 Event::Written
             }
             Action::ReadStaging { bytes } => {
-                let bytes = self.read(self.profile.registers.staging, *bytes);
+                let bytes = self.read(self.profile.transport.modbus().unwrap().registers.staging, *bytes);
                 self.read_back_was_equal = bytes == self.staged;
                 Event::ReadBack(bytes)
             }

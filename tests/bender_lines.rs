@@ -4,10 +4,10 @@
 
 use std::time::Duration;
 
-use benderd::bender::{Bender as _, LinkError, ModbusLink, Profile, TableId, Transport, Wire};
+use benderd::bender::{Bender as _, Link, LinkError, Profile, TableId, Transport, Wire};
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
-use benderd::sim::door::Door;
+use benderd::sim::door::{Door, Speech};
 use benderd::sim::faults::{ReplyFault, WireFaults};
 use benderd::sim::frames::Framing;
 use benderd::sim::pty::machine_end;
@@ -24,14 +24,15 @@ const QUIET_MS: u64 = 500;
 fn profile() -> Profile {
     let mut profile = Profile::load("reference-rtu").unwrap();
     profile.deadlines.request = Duration::from_millis(REQUEST_MS);
-    profile.modbus.max_read_registers = 4;
+    let Transport::ModbusRtu(map, ..) = &mut profile.transport else { panic!() };
+    map.max_read_registers = 4;
     profile
 }
 
-fn link(profile: Profile, wire: DuplexStream) -> ModbusLink {
+fn link(profile: Profile, wire: DuplexStream) -> Link {
     let mut wire = Some(wire);
     let open = move || Ok(Box::new(wire.take().unwrap()) as Box<dyn Wire>);
-    ModbusLink::over(profile, "a line in memory", Box::new(open)).unwrap()
+    Link::over(profile, "a line in memory", Box::new(open)).unwrap()
 }
 
 /// A machine at the end of a wire in memory, whose staging area holds its own addresses; what happens to its answers.
@@ -40,7 +41,9 @@ fn machine(wire: DuplexStream, faults: &[Option<ReplyFault>]) -> SimulatedBender
     model.write(1000, &(1000..1100).collect::<Vec<u16>>()).unwrap();
     let (tell, wires) = mpsc::unbounded_channel();
     tell.send(wire).unwrap();
-    let bender = SimulatedBender::start(Door::Memory(Framing::Rtu, wires), model, None, |_| ()).unwrap();
+    let bender =
+        SimulatedBender::start(Door::Memory(Speech::Modbus(Framing::Rtu), wires), model, None, |_| ())
+            .unwrap();
     bender.set_wire_faults(Some(WireFaults::script(faults.iter().copied())));
     bender
 }
@@ -147,7 +150,7 @@ async fn a_line_with_an_echo_works_when_the_profile_says_so() {
         }
     });
     let mut profile = profile();
-    let Transport::ModbusRtu(settings, _) = &mut profile.transport else { panic!() };
+    let Transport::ModbusRtu(_, settings, _) = &mut profile.transport else { panic!() };
     settings.echo = true;
     let staging = link(profile, here).read_staging(8).await.unwrap();
     assert_eq!(words(&staging), [1000, 1001, 1002, 1003]);
@@ -156,7 +159,7 @@ async fn a_line_with_an_echo_works_when_the_profile_says_so() {
 /// 400 seeds with every tenth answer damaged, and trouble at the machine; `examples/deliveries` runs more.
 #[test]
 fn whatever_a_wire_does_the_table_is_whole_and_the_record_true() {
-    for profile in ["reference-rtu", "reference-modbus"] {
+    for profile in ["reference-rtu", "reference-modbus", "reference-serial"] {
         campaign(&Profile::load(profile).unwrap());
     }
 }
@@ -184,13 +187,15 @@ fn quick(name: &str) -> Profile {
 
 #[tokio::test]
 async fn a_table_is_delivered_through_a_pseudo_terminal() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("bender");
-    let profile = quick("reference-rtu");
-    let (ends, kept) = real(&profile, &path.display().to_string()).await.unwrap();
-    assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
-    drop(kept);
-    assert!(!path.is_symlink(), "its name is taken away");
+    for profile in ["reference-rtu", "reference-serial"] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bender");
+        let profile = quick(profile);
+        let (ends, kept) = real(&profile, &path.display().to_string()).await.unwrap();
+        assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
+        drop(kept);
+        assert!(!path.is_symlink(), "its name is taken away");
+    }
 }
 
 #[tokio::test]
@@ -207,17 +212,17 @@ async fn a_port_that_another_program_has_open_or_that_cannot_do_rs485_says_so() 
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("bender");
     let mut profile = quick("reference-rtu");
-    let Transport::ModbusRtu(_, settings) = &mut profile.transport else { panic!() };
+    let Transport::ModbusRtu(_, _, settings) = &mut profile.transport else { panic!() };
     let _end = machine_end(&path, settings).unwrap();
     let _other = benderd::bender::serial_port(path.to_str().unwrap(), settings).unwrap();
     let failed = |profile: Profile| {
         let path = path.display().to_string();
-        async move { ModbusLink::new(profile, path).unwrap().read_status().await.unwrap_err().to_string() }
+        async move { Link::new(profile, path).unwrap().read_status().await.unwrap_err().to_string() }
     };
     let text = failed(profile.clone()).await;
     assert!(text.contains("another program has it open"), "{text}");
     drop(_other);
-    let Transport::ModbusRtu(_, settings) = &mut profile.transport else { panic!() };
+    let Transport::ModbusRtu(_, _, settings) = &mut profile.transport else { panic!() };
     settings.rs485 = true;
     let text = failed(profile).await;
     assert!(text.contains("serial.rs485 = false"), "{text}");

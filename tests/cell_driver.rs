@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use benderd::arm::{ArmError, Filing, FolderSettings, ScanFile, ScanSource, WatchedFolder};
-use benderd::bender::{ModbusLink, Profile};
+use benderd::bender::{Link, Profile};
 use benderd::cell::{Command, Craft, Decision, Driver, Dwell, Identity, Notice, Part, State};
 use benderd::config::Mode;
 use benderd::correct::{Answer, Code, Reason, Verdict};
@@ -79,7 +79,7 @@ async fn cell(mode: Mode, fault: Option<Fault>, verdicts: &[Verdict]) -> Cell {
     let source = WatchedFolder::open(settings).await.unwrap();
     let journal = || Journal::open(&dir.path().join("journal.db")).unwrap();
     let identity = Identity { name: "b1".into(), program: PROGRAM.into(), mode, dwell: Dwell::default() };
-    let link = ModbusLink::new(profile, bender.address().to_string()).unwrap();
+    let link = Link::new(profile, bender.address().to_string()).unwrap();
     let craft = Script(Mutex::new(verdicts.to_vec()));
     let driver = Driver::new(identity, link, source, craft, [journal(), journal()]).unwrap();
     let notices = driver.listen();
@@ -253,7 +253,7 @@ async fn an_intent_without_an_end_is_closed_by_what_the_machine_holds() {
         mode: Mode::Automatic,
         dwell: Dwell::default(),
     };
-    let link = ModbusLink::new(profile, bender.address().to_string()).unwrap();
+    let link = Link::new(profile, bender.address().to_string()).unwrap();
     let open = || Journal::open(&path).unwrap();
     let driver =
         Driver::new(identity, link, NoScans, Script(Mutex::new(Vec::new())), [open(), open()]).unwrap();
@@ -312,7 +312,7 @@ async fn a_scan_that_cannot_be_filed_away_is_not_taken_twice() {
     let bender = SimulatedBender::start(Door::Socket(Framing::Tcp, listener), model, None, |_| {}).unwrap();
     let identity =
         Identity { name: "b1".into(), program: PROGRAM.into(), mode: Mode::Observe, dwell: Dwell::default() };
-    let link = ModbusLink::new(profile, bender.address().to_string()).unwrap();
+    let link = Link::new(profile, bender.address().to_string()).unwrap();
     let open = || Journal::open(&dir.path().join("journal.db")).unwrap();
     let driver =
         Driver::new(identity, link, Stuck, Script(Mutex::new(Vec::new())), [open(), open()]).unwrap();

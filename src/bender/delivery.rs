@@ -313,13 +313,13 @@ impl Delivery {
         }
         let at = bytes.iter().zip(&self.image).position(|(a, b)| a != b);
         let at = at.unwrap_or(bytes.len().min(self.image.len()));
-        let address = usize::from(self.profile.registers.staging) + at / 2;
+        let place = self.profile.transport.staging_place(at);
         let hex = |side: &[u8]| {
             side.get(at & !1..(at | 1) + 1)
                 .map_or("nothing".into(), |w| format!("0x{:02X}{:02X}", w[0], w[1]))
         };
         let text = format!(
-            "the staging area does not read back as written: register {address} holds {}, written was {}; \
+            "the staging area does not read back as written: {place} holds {}, written was {}; \
              nothing was committed",
             hex(bytes),
             hex(&self.image)

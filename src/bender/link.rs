@@ -89,6 +89,14 @@ pub enum LinkError {
         /// Modbus exception with its number.
         exception: String,
     },
+    /// The machine has no time for the request now.
+    #[error("{endpoint}: the machine was busy at {what}")]
+    Busy {
+        /// Where.
+        endpoint: String,
+        /// What was asked.
+        what: String,
+    },
     /// An answer that cannot be right.
     #[error("{endpoint}: {why}")]
     Nonsense {

@@ -4,46 +4,70 @@
 //! [`Delivery`] over a [`Bender`] and answers with an [`Outcome`]. On the way:
 //!
 //! ```text
-//! profile   what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
-//! transport which link leads there
-//! limits    the gate's figures: travel, clamp lengths, row count
-//! wire      tables to bytes and back, CRC, status word by word
-//! delivery  stage, verify, commit: events and time in, one action out
-//! driver    performs the actions on a link and a journal
-//! contact   when a link connects, asks, keeps silent: events and time in, one action out
-//! modbus    the Modbus link: TCP, RTU, RTU over TCP
-//! plan      the requests that a profile asks for
-//! line      a line under it: no old reply is taken for a new one
+//! profile       what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
+//! transport     which link leads there
+//! limits        the gate's figures: travel, clamp lengths, row count
+//! wire          tables to bytes and back, CRC
+//! delivery      stage, verify, commit: events and time in, one action out
+//! driver        performs the actions on a link and a journal
+//! contact       when a link connects, asks, keeps silent: events and time in, one action out
+//! caller        one machine's connection, under every link
+//! any_link      the link that a profile asks for
+//!
+//! modbus        machines with registers: TCP, RTU, RTU over TCP
+//! registers     where their values are; plan: the requests that makes
+//!
+//! table_link    machines with objects: one exchange after the other
+//! exchange      what is asked, and a protocol's side of it as a pure machine
+//! serial_table  such a protocol, on a serial port; serial_frame: its frames
+//! status_image  the status as one row of bytes
+//!
+//! line          a line under it all: no old reply is taken for a new one
 //! ```
 
+mod any_link;
+mod caller;
 mod contact;
 mod delivery;
 mod driver;
+mod exchange;
 mod limits;
 mod line;
+mod line_port;
 mod link;
 mod modbus;
 mod open;
 pub mod plan;
 mod profile;
 mod profile_file;
+mod profile_modbus;
 mod profile_transport;
+mod registers;
 mod rs485;
+mod serial_frame;
+mod serial_table;
+mod status_image;
+mod table_link;
 mod transport;
 mod wire;
 
+pub use any_link::Link;
 pub use contact::RulesError;
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
 pub use driver::{IntentLog, LogError, deliver};
+pub use exchange::{
+    Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
+};
 pub use limits::{Reason, check_limits};
 pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
-pub use modbus::ModbusLink;
 pub use open::{Opener, serial_port};
-pub use profile::{Deadlines, ModbusFormat, Profile, Registers, StateBit, TableFormat, WordOrder};
+pub use profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
+pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
+pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{
-    Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, decode_status,
-    encode_payload, payload_bytes, staging_image, status_span,
+    Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, encode_payload,
+    payload_bytes, staging_image,
 };

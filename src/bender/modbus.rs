@@ -13,22 +13,18 @@ use tokio::time::{Duration, Instant, sleep_until, timeout_at};
 use tokio_modbus::client::{Client as _, rtu};
 use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
-use super::contact::{Action, Contact, Event, Rules, RulesError, State};
+use super::caller::{Caller, Next, millis};
+use super::contact::{Event, RulesError};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::open::{Connection, Opener, open};
 use super::plan;
 use super::profile::Profile;
+use super::registers::{ModbusMap, decode_status};
 use super::transport::Transport;
-use super::wire::{
-    Staged, Status, TableId, commit_image, crc_of, decode_status, payload_bytes, staging_image,
-};
+use super::wire::{Staged, Status, TableId, commit_image, crc_of, payload_bytes, staging_image};
 
 /// How often a device that says "busy" is asked again.
 const BUSY_RETRIES: u32 = 3;
-
-/// Between two attempts to connect no more than this share of the time in which a commit is confirmed: after it the machine
-/// must be asked.
-const LONGEST_WAIT_SHARE: u64 = 4;
 
 /// How often what a line garbled or lost is asked again.
 const LINE_RETRIES: u32 = 2;
@@ -39,141 +35,57 @@ const FOREIGN_LOOKS: usize = 2;
 /// A bender behind Modbus.
 pub struct ModbusLink {
     profile: Profile,
-    endpoint: String,
+    map: ModbusMap,
     opener: Option<Opener>,
-    connection: Option<Connection>,
-    contact: Contact,
-    since: Instant,
+    caller: Caller<Connection>,
     /// When something was last heard.
     heard: Instant,
-    /// The contact's epoch in which the status was read last.
-    seen: Option<u64>,
 }
 
 impl ModbusLink {
-    /// A link that connects at its first use; `endpoint` is what the profile's transport takes.
-    pub fn new(profile: Profile, endpoint: impl Into<String>) -> Result<ModbusLink, RulesError> {
-        let (endpoint, deadlines) = (endpoint.into(), &profile.deadlines);
-        let first_ms = deadlines.poll_ms;
-        let waits = (first_ms, (deadlines.confirm_ms / LONGEST_WAIT_SHARE).max(first_ms));
-        let silence_ms = profile.transport.line().map(|line| millis(line.quiet));
-        let rules = Rules::new(waits, millis(deadlines.connect), millis(deadlines.request), silence_ms)?;
-        let contact = Contact::new(rules, u64::from(crc_of(endpoint.as_bytes())));
-        let now = Instant::now();
-        Ok(ModbusLink {
-            profile,
-            endpoint,
-            opener: None,
-            connection: None,
-            contact,
-            since: now,
-            heard: now,
-            seen: None,
-        })
-    }
-
-    /// The same over wires that `opener` makes; the endpoint is their name.
-    pub fn over(
+    /// A link that connects at its first use; `endpoint` is what the profile's transport takes. Where there is an `opener`, over
+    /// the wires that it makes.
+    pub fn new(
         profile: Profile,
-        endpoint: impl Into<String>,
-        opener: Opener,
+        map: ModbusMap,
+        endpoint: String,
+        opener: Option<Opener>,
     ) -> Result<ModbusLink, RulesError> {
-        Ok(ModbusLink { opener: Some(opener), ..ModbusLink::new(profile, endpoint)? })
-    }
-
-    /// Tells the contact what happened.
-    fn on(&mut self, event: Event) -> Action {
-        self.contact.on(event, millis(self.since.elapsed()))
-    }
-
-    /// The time at a contact's millisecond.
-    fn at(&self, ms: u64) -> Instant {
-        self.since + Duration::from_millis(ms)
-    }
-
-    async fn connect(&mut self, until_ms: u64) -> Result<(), LinkError> {
-        let until = self.at(until_ms);
-        let opening = open(&self.profile, &self.endpoint, self.opener.as_mut());
-        let opened = match timeout_at(until, opening).await {
-            Ok(opened) => opened.map_err(|e| e.to_string()),
-            Err(_) => Err(format!("no answer within {} ms", self.profile.deadlines.connect.as_millis())),
-        };
-        match opened {
-            Ok(connection) => {
-                self.connection = Some(connection);
-                self.on(Event::Opened);
-                Ok(())
-            }
-            Err(why) => {
-                self.on(Event::NotOpened);
-                Err(LinkError::Connect { endpoint: self.endpoint.clone(), why })
-            }
-        }
+        let silence_ms = profile.transport.line().map(|line| millis(line.quiet));
+        let asking_ms = millis(profile.deadlines.request);
+        let caller = Caller::new(endpoint, &profile.deadlines, asking_ms, silence_ms)?;
+        Ok(ModbusLink { profile, map, opener, caller, heard: Instant::now() })
     }
 
     /// Opens the connection if need be, and lets a line be silent; until when a reply is waited for.
     async fn ready(&mut self) -> Result<Instant, LinkError> {
-        loop {
-            match self.on(Event::Wanted) {
-                Action::Send { until_ms } => return Ok(self.at(until_ms)),
-                Action::Open { until_ms } => self.connect(until_ms).await?,
-                Action::Refuse { until_ms } if matches!(self.contact.state(), State::Silent { .. }) => {
-                    sleep_until(self.at(until_ms)).await;
-                }
-                _ => return Err(self.resting()),
-            }
-        }
-    }
-
-    /// A call that was cancelled has left the contact waiting for its answer.
-    fn give_up_cancelled(&mut self) {
-        if matches!(self.contact.state(), State::Opening { .. } | State::Asking { .. }) {
-            self.perform(Event::Doubted);
-        }
-    }
-
-    /// Tells the contact what happened, and drops a connection that was given up.
-    fn perform(&mut self, event: Event) {
-        self.on(event);
-        if !self.contact.keeps_connection() {
-            self.connection = None;
-        }
-    }
-
-    /// Between two frames on a serial line it is silent.
-    async fn let_frame_end(&mut self) {
-        if let Transport::ModbusRtu(_, serial) = &self.profile.transport {
+        self.caller.give_up_cancelled();
+        // Between two frames on a serial line it is silent.
+        if let Transport::ModbusRtu(_, _, serial) = &self.profile.transport {
             sleep_until(self.heard + serial.gap()).await;
         }
-    }
-
-    fn resting(&self) -> LinkError {
-        let now_ms = millis(self.since.elapsed());
-        let (endpoint, failures) = (self.endpoint.clone(), self.contact.failures());
-        match self.contact.state() {
-            State::Faulted { until_ms } => {
-                LinkError::Foreign { endpoint, ms: until_ms.saturating_sub(now_ms) }
+        loop {
+            match self.caller.next().await? {
+                Next::Send(until) => return Ok(until),
+                Next::Open(until) => {
+                    let endpoint = self.caller.endpoint().to_owned();
+                    let opening = open(&self.profile, self.map.unit_id, &endpoint, self.opener.as_mut());
+                    self.caller.open(until, opening).await?;
+                }
             }
-            State::Away { retry_ms } => {
-                LinkError::Resting { endpoint, failures, ms: retry_ms.saturating_sub(now_ms) }
-            }
-            _ => LinkError::Resting { endpoint, failures, ms: 0 },
         }
     }
 
     /// One request and its checked reply.
     async fn call(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
-        self.give_up_cancelled();
-        self.let_frame_end().await;
         let until = self.ready().await?;
-        let (endpoint, what) = (self.endpoint.clone(), describe(&request));
+        let (endpoint, what) = (self.caller.endpoint().to_owned(), describe(&request));
         let broken = |what, why| LinkError::Broken { endpoint: endpoint.clone(), what, why };
-        let Some(connection) = &mut self.connection else { return Err(self.resting()) };
         let mut once;
-        let client = match connection {
+        let client = match self.caller.connection()? {
             Connection::Stream(client) => client,
             Connection::Line(line) => {
-                once = rtu::attach_slave(line.clone(), Slave(self.profile.unit_id));
+                once = rtu::attach_slave(line.clone(), Slave(self.map.unit_id));
                 &mut once
             }
         };
@@ -197,7 +109,7 @@ impl ModbusLink {
                 Err(why) => (Event::Doubted, Err(broken(what, why))),
             },
         };
-        self.perform(event);
+        self.caller.perform(event);
         result
     }
 
@@ -229,7 +141,7 @@ impl ModbusLink {
     }
 
     fn nonsense(&self, why: String) -> LinkError {
-        LinkError::Nonsense { endpoint: self.endpoint.clone(), why }
+        LinkError::Nonsense { endpoint: self.caller.endpoint().to_owned(), why }
     }
 }
 
@@ -239,26 +151,26 @@ impl Bender for ModbusLink {
     }
 
     fn endpoint(&self) -> &str {
-        &self.endpoint
+        self.caller.endpoint()
     }
 
     fn reset(&mut self) {
-        self.perform(Event::Reset);
+        self.caller.perform(Event::Reset);
     }
 
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         let mut wrong = String::new();
         for _ in 0..FOREIGN_LOOKS {
-            let bytes = self.read(vec![plan::status(&self.profile)]).await?;
-            match decode_status(&self.profile, &bytes) {
+            let bytes = self.read(vec![plan::status(&self.profile, &self.map)]).await?;
+            match decode_status(&self.profile, &self.map, &bytes) {
                 Ok(status) => {
-                    self.seen = Some(self.contact.epoch());
+                    self.caller.has_seen();
                     return Ok(status);
                 }
                 Err(why) => wrong = why,
             }
         }
-        self.perform(Event::Foreign);
+        self.caller.perform(Event::Foreign);
         Err(self.nonsense(wrong))
     }
 
@@ -266,7 +178,7 @@ impl Bender for ModbusLink {
         let image = staging_image(&self.profile, staged);
         let words = words_of(&image);
         let mut rest = &words[..];
-        for request in plan::writes(&self.profile, self.profile.registers.staging, image.len()) {
+        for request in plan::writes(&self.map, self.map.registers.staging, image.len()) {
             let (now, later) = rest.split_at(usize::from(request.registers));
             self.call_patiently(Request::WriteMultipleRegisters(request.address, Cow::Borrowed(now))).await?;
             rest = later;
@@ -275,29 +187,25 @@ impl Bender for ModbusLink {
     }
 
     async fn read_staging(&mut self, bytes: usize) -> Result<Vec<u8>, LinkError> {
-        self.read(plan::reads(&self.profile, self.profile.registers.staging, bytes)).await
+        self.read(plan::reads(&self.map, self.map.registers.staging, bytes)).await
     }
 
     async fn commit(&mut self, id: TableId) -> Result<(), LinkError> {
         let words = words_of(&commit_image(&self.profile, id));
-        let request = Request::WriteMultipleRegisters(self.profile.registers.commit, Cow::Owned(words));
-        self.give_up_cancelled();
-        if self.seen != Some(self.contact.epoch()) {
-            let what = describe(&request);
-            return Err(LinkError::Outdated { endpoint: self.endpoint.clone(), what });
-        }
+        let request = Request::WriteMultipleRegisters(self.map.registers.commit, Cow::Owned(words));
+        self.caller.check_seen(|| describe(&request))?;
         self.call(request).await?;
         Ok(())
     }
 
     async fn read_active(&mut self) -> Result<ActiveTable, LinkError> {
         let status = self.read_status().await?;
-        let (address, header) = (self.profile.registers.active, self.profile.payload_header_bytes());
+        let (address, header) = (self.map.registers.active, self.profile.payload_header_bytes());
         if status.active.revision == 0 {
             return Ok(ActiveTable { status, payload: Vec::new() });
         }
-        let mut payload = self.read(plan::reads(&self.profile, address, header)).await?;
-        let name = 2 * usize::from(self.profile.table.program_registers);
+        let mut payload = self.read(plan::reads(&self.map, address, header)).await?;
+        let name = self.profile.table.program_bytes;
         let bends = usize::from(u16::from_be_bytes([payload[name], payload[name + 1]]));
         let most = self.profile.limits.max_bends;
         if bends > most {
@@ -306,7 +214,7 @@ impl Bender for ModbusLink {
             );
         }
         let rows = payload_bytes(&self.profile, bends) - header;
-        payload.extend(self.read(plan::reads(&self.profile, plan::rows(&self.profile), rows)).await?);
+        payload.extend(self.read(plan::reads(&self.map, plan::rows(&self.profile, &self.map), rows)).await?);
         let crc = crc_of(&payload);
         if crc != status.active.crc {
             return Err(self.nonsense(format!(
@@ -316,10 +224,6 @@ impl Bender for ModbusLink {
         }
         Ok(ActiveTable { status, payload })
     }
-}
-
-fn millis(time: Duration) -> u64 {
-    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 fn words_of(bytes: &[u8]) -> Vec<u16> {

@@ -1,6 +1,6 @@
-//! Opens what leads to a Modbus machine: a socket, a serial port, or what stands for one.
+//! Opens what leads to a machine: a socket, a serial port, or what stands for one.
 //!
-//! Under `modbus`, which decides when.
+//! Under the links, which decide when.
 
 use std::io;
 
@@ -12,7 +12,7 @@ use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
 use super::line::{Line, Wire};
 use super::profile::Profile;
 use super::rs485;
-use super::transport::{Parity, SerialSettings, Transport};
+use super::transport::{Parity, SerialSettings};
 
 /// What leads to the machine, open.
 pub enum Connection {
@@ -25,16 +25,30 @@ pub enum Connection {
 /// Opens a wire that is no device of this computer: one in memory.
 pub type Opener = Box<dyn FnMut() -> io::Result<Box<dyn Wire>> + Send>;
 
-/// Opens what a profile's transport leads over.
-pub async fn open(profile: &Profile, endpoint: &str, opener: Option<&mut Opener>) -> io::Result<Connection> {
-    let wire: Box<dyn Wire> = match (opener, &profile.transport) {
-        (Some(opener), _) => opener()?,
-        (None, Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_)) => Box::new(socket(endpoint).await?),
-        (None, Transport::ModbusRtu(_, settings)) => Box::new(serial_port(endpoint, settings)?),
-    };
+/// Opens the way to a Modbus device.
+pub async fn open(
+    profile: &Profile,
+    unit_id: u8,
+    endpoint: &str,
+    opener: Option<&mut Opener>,
+) -> io::Result<Connection> {
+    let wire = wire(profile, endpoint, opener).await?;
     Ok(match profile.transport.line() {
-        None => Connection::Stream(tcp::attach_slave(wire, Slave(profile.unit_id))),
+        None => Connection::Stream(tcp::attach_slave(wire, Slave(unit_id))),
         Some(line) => Connection::Line(Line::new(wire, line.echo)),
+    })
+}
+
+/// What a profile's transport leads over.
+pub async fn wire(
+    profile: &Profile,
+    endpoint: &str,
+    opener: Option<&mut Opener>,
+) -> io::Result<Box<dyn Wire>> {
+    Ok(match (opener, profile.transport.serial()) {
+        (Some(opener), _) => opener()?,
+        (None, Some(settings)) => Box::new(serial_port(endpoint, settings)?),
+        (None, None) => Box::new(socket(endpoint).await?),
     })
 }
 

@@ -1,8 +1,9 @@
 //! What a profile makes benderd ask of a machine, request by request: the link makes these requests, `benderd check --plan` prints
 //! them for the PLC programmer.
 
-use super::profile::{Profile, Registers};
-use super::wire::{payload_bytes, status_span};
+use super::profile::Profile;
+use super::registers::{ModbusMap, status_span};
+use super::wire::payload_bytes;
 
 /// One request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,75 +32,42 @@ pub struct Step {
     pub requests: Vec<Request>,
 }
 
-/// A value that the machine keeps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Field {
-    /// What it is.
-    pub name: &'static str,
-    /// Where it begins.
-    pub address: u16,
-    /// How many registers it takes.
-    pub registers: u16,
-}
-
 /// The requests of one delivery of a table with so many bends, in order.
-pub fn delivery(profile: &Profile, bends: usize) -> Vec<Step> {
-    let r = &profile.registers;
+pub fn delivery(profile: &Profile, map: &ModbusMap, bends: usize) -> Vec<Step> {
+    let r = &map.registers;
     let (payload, header) = (payload_bytes(profile, bends), profile.payload_header_bytes());
     let step = |what, requests| Step { what, requests };
-    let status = || vec![status(profile)];
-    let active = [reads(profile, r.active, header), reads(profile, rows(profile), payload - header)].concat();
+    let status = || vec![status(profile, map)];
+    let active = [reads(map, r.active, header), reads(map, rows(profile, map), payload - header)].concat();
     vec![
         step("who is there, and may it be changed", status()),
-        step("stage", writes(profile, r.staging, 8 + payload)),
-        step("read back", reads(profile, r.staging, 8 + payload)),
+        step("stage", writes(map, r.staging, 8 + payload)),
+        step("read back", reads(map, r.staging, 8 + payload)),
         step("still so, and the program runs", status()),
         step("commit, once", vec![Request { writes: true, address: r.commit, registers: 4 }]),
         step("what is in force now", [status(), active].concat()),
     ]
 }
 
-/// The values outside of staging and active area, in the order of their addresses.
-pub fn fields(profile: &Profile) -> Vec<Field> {
-    let Registers { identification, layout, heartbeat, state, bend_count, program, .. } = profile.registers;
-    let Registers { active_revision, active_crc, ack_revision, ack_code, commit, .. } = profile.registers;
-    let field = |name, address, registers| Field { name, address, registers };
-    let mut fields = vec![
-        field("identification", identification, 2),
-        field("layout", layout, 1),
-        field("heartbeat", heartbeat, 1),
-        field("state", state, 1),
-        field("bend count", bend_count, 1),
-        field("program", program, profile.table.program_registers),
-        field("active revision", active_revision, 2),
-        field("active CRC", active_crc, 2),
-        field("acknowledged revision", ack_revision, 2),
-        field("acknowledgement", ack_code, 1),
-        field("commit: revision, CRC", commit, 4),
-    ];
-    fields.sort_by_key(|f| f.address);
-    fields
-}
-
 /// The one request that shows the status.
-pub fn status(profile: &Profile) -> Request {
-    let (address, registers) = status_span(profile);
+pub fn status(profile: &Profile, map: &ModbusMap) -> Request {
+    let (address, registers) = status_span(profile, map);
     Request { writes: false, address, registers }
 }
 
 /// Where the rows of the active table begin; the profile's check keeps the area below 65536.
-pub fn rows(profile: &Profile) -> u16 {
-    profile.registers.active + (profile.payload_header_bytes() / 2) as u16
+pub fn rows(profile: &Profile, map: &ModbusMap) -> u16 {
+    map.registers.active + (profile.payload_header_bytes() / 2) as u16
 }
 
 /// Requests that read so many bytes.
-pub fn reads(profile: &Profile, address: u16, bytes: usize) -> Vec<Request> {
-    chunks(false, address, bytes / 2, profile.modbus.max_read_registers)
+pub fn reads(map: &ModbusMap, address: u16, bytes: usize) -> Vec<Request> {
+    chunks(false, address, bytes / 2, map.max_read_registers)
 }
 
 /// Requests that write so many bytes.
-pub fn writes(profile: &Profile, address: u16, bytes: usize) -> Vec<Request> {
-    chunks(true, address, bytes / 2, profile.modbus.max_write_registers)
+pub fn writes(map: &ModbusMap, address: u16, bytes: usize) -> Vec<Request> {
+    chunks(true, address, bytes / 2, map.max_write_registers)
 }
 
 /// `limit` is even and so is the distance of every 32-bit value from the start, so none is split.
@@ -131,10 +99,11 @@ mod tests {
     #[test]
     fn the_commit_is_one_request_after_all_others_that_write() {
         let profile = Profile::load("reference-modbus").unwrap();
+        let map = profile.transport.modbus().unwrap();
         for bends in 1..=profile.limits.max_bends {
             let requests: Vec<Request> =
-                delivery(&profile, bends).into_iter().flat_map(|s| s.requests).collect();
-            let commit = requests.iter().position(|r| r.address == profile.registers.commit).unwrap();
+                delivery(&profile, map, bends).into_iter().flat_map(|s| s.requests).collect();
+            let commit = requests.iter().position(|r| r.address == map.registers.commit).unwrap();
             assert!(requests[commit].writes && requests[commit].registers == 4);
             assert!(requests[commit + 1..].iter().all(|r| !r.writes));
         }

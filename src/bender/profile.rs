@@ -19,15 +19,9 @@ pub struct Profile {
     pub transport: Transport,
     /// Where the machine is: what the transport takes.
     pub endpoint: String,
-    /// Modbus unit identifier.
-    pub unit_id: u8,
-    /// Word order and request sizes.
-    pub modbus: ModbusFormat,
-    /// Where things are.
-    pub registers: Registers,
-    /// Value of the identification register.
+    /// The constant by which the machine is known.
     pub identification: u32,
-    /// Value of the layout register.
+    /// Version of the layout of what it keeps.
     pub layout: u16,
     /// How a table is written in integers.
     pub table: TableFormat,
@@ -37,17 +31,6 @@ pub struct Profile {
     pub limits: MachineLimits,
     /// How long to wait for what.
     pub deadlines: Deadlines,
-}
-
-/// Word order and request sizes of one Modbus device.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ModbusFormat {
-    /// Order of the four bytes of a 32-bit value.
-    pub word_order: WordOrder,
-    /// Registers per read request, even, 4 to 125.
-    pub max_read_registers: u16,
-    /// Registers per write request, even, 4 to 123.
-    pub max_write_registers: u16,
 }
 
 /// How the bytes of a 32-bit value lie in two registers, `A` being the most significant.
@@ -75,42 +58,13 @@ impl WordOrder {
     }
 }
 
-/// Addresses of holding registers, counted from 0. No two areas overlap.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Registers {
-    /// u32 constant that proves map and word order.
-    pub identification: u16,
-    /// u16 constant, version of the layout.
-    pub layout: u16,
-    /// u16 that counts up while the controller's program runs.
-    pub heartbeat: u16,
-    /// u16 state word.
-    pub state: u16,
-    /// u16, bends of the loaded program.
-    pub bend_count: u16,
-    /// Text, name of the loaded program.
-    pub program: u16,
-    /// u32, revision of the table in force.
-    pub active_revision: u16,
-    /// u32, CRC of the table in force.
-    pub active_crc: u16,
-    /// u32, revision that the last acknowledgement speaks of.
-    pub ack_revision: u16,
-    /// u16, the acknowledgement.
-    pub ack_code: u16,
-    /// u32 revision and u32 CRC, the commit word; the controller clears it when it has dealt with it.
-    pub commit: u16,
-    /// u32 revision, u32 CRC, then the payload.
-    pub staging: u16,
-    /// The payload in force.
-    pub active: u16,
-}
-
 /// How a table is written in integers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TableFormat {
-    /// Registers of a program name, even, two characters each.
-    pub program_registers: u16,
+    /// Longest name of a program, in bytes; a multiple of 4.
+    pub program_bytes: usize,
+    /// Order of the four bytes of a 32-bit value.
+    pub word_order: WordOrder,
     /// Millimetres per count.
     pub length_resolution_mm: f64,
     /// Degrees per count, for angles and rotations.
@@ -137,6 +91,8 @@ pub struct Deadlines {
     pub connect: Duration,
     /// For one reply.
     pub request: Duration,
+    /// For a whole object, where that takes several replies; over Modbus each has its own.
+    pub transfer: Duration,
     /// Longest time in which a live machine's heartbeat stands still, milliseconds.
     pub heartbeat_ms: u64,
     /// From the commit to the table being active, milliseconds.
@@ -150,7 +106,7 @@ pub struct Deadlines {
 impl Profile {
     /// Bytes of a payload before its first row: program, count, spare, last length.
     pub fn payload_header_bytes(&self) -> usize {
-        2 * (usize::from(self.table.program_registers) + 4)
+        self.table.program_bytes + 8
     }
 
     /// Bytes of one row: length, rotation, angle, four each.

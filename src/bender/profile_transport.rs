@@ -4,15 +4,17 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::Deserialize;
-use toml::Spanned;
 
+use super::profile::WordOrder;
 use super::profile_file::integer;
+use super::profile_modbus::{RawModbus, RawRegisters, parse_modbus};
 use super::transport::{LineSettings, Parity, SerialSettings, Transport};
-use crate::config::{ConfigError, Document};
+use crate::config::{At, ConfigError, Document};
 
 /// The links that exist.
-#[derive(Debug, Clone, Copy, Deserialize)]
+#[derive(Debug, Clone, Copy, Deserialize, JsonSchema)]
 pub enum RawTransport {
     #[serde(rename = "modbus-tcp")]
     Tcp,
@@ -20,47 +22,109 @@ pub enum RawTransport {
     Rtu,
     #[serde(rename = "modbus-rtu-over-tcp")]
     RtuOverTcp,
+    #[serde(rename = "serial-table")]
+    SerialTable,
 }
 
-#[derive(Deserialize)]
+impl RawTransport {
+    /// Whether a part of the file belongs to this transport.
+    fn needs(self, section: &str) -> bool {
+        let needed: &[&str] = match self {
+            RawTransport::Tcp => &["unit_id", "[modbus], [registers]"],
+            RawTransport::Rtu => &["unit_id", "[modbus], [registers]", "[line]", "[serial]"],
+            RawTransport::RtuOverTcp => &["unit_id", "[modbus], [registers]", "[line]"],
+            RawTransport::SerialTable => &["unit_id", "[line]", "[serial]"],
+        };
+        needed.contains(&section)
+    }
+}
+
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RawLine {
-    quiet_ms: Spanned<i64>,
+    quiet_ms: At<i64>,
     echo: bool,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RawSerial {
-    baud: Spanned<i64>,
+    baud: At<i64>,
     parity: Parity,
-    stop_bits: Spanned<i64>,
+    stop_bits: At<i64>,
     rs485: bool,
+}
+
+/// The parts of a file that some transports need and others have no use for.
+pub struct Sections<'a> {
+    /// Who is asked on a line that has several.
+    pub unit_id: Option<&'a At<i64>>,
+    /// `[modbus]` and `[registers]`.
+    pub modbus: Option<(&'a RawModbus, &'a RawRegisters)>,
+    /// `[line]`.
+    pub line: Option<&'a RawLine>,
+    /// `[serial]`.
+    pub serial: Option<&'a RawSerial>,
+}
+
+impl Sections<'_> {
+    /// Of 32-bit values; where the file says nothing, the highest byte first.
+    pub fn word_order(&self) -> WordOrder {
+        self.modbus.map_or(WordOrder::Abcd, |(modbus, _)| modbus.word_order.into())
+    }
+
+    fn all(&self) -> [(&'static str, bool); 4] {
+        [
+            ("unit_id", self.unit_id.is_some()),
+            ("[modbus], [registers]", self.modbus.is_some()),
+            ("[line]", self.line.is_some()),
+            ("[serial]", self.serial.is_some()),
+        ]
+    }
 }
 
 /// The transport with all that it needs and nothing that it has no use for.
 pub fn parse_transport(
     doc: &Document,
-    transport: &Spanned<RawTransport>,
-    line: Option<&RawLine>,
-    serial: Option<&RawSerial>,
+    transport: &At<RawTransport>,
+    sections: &Sections<'_>,
 ) -> Result<Transport, ConfigError> {
-    let wrong = |allowed: &str| {
-        let name = doc.text().get(transport.span()).unwrap_or("");
-        Err(doc.value_error(transport.span(), "transport", name, allowed))
-    };
-    match (transport.get_ref(), line, serial) {
-        (RawTransport::Tcp, None, None) => Ok(Transport::ModbusTcp),
-        (RawTransport::Tcp, ..) => wrong("without [line] and [serial]"),
-        (RawTransport::Rtu, Some(line), Some(serial)) => {
-            Ok(Transport::ModbusRtu(parse_line(doc, line)?, parse_serial(doc, serial)?))
+    let map = |unit_id, (modbus, registers)| parse_modbus(doc, unit_id, modbus, registers);
+    Ok(match (transport.get_ref(), sections) {
+        (
+            RawTransport::Tcp,
+            Sections { unit_id: Some(unit), modbus: Some(modbus), line: None, serial: None },
+        ) => Transport::ModbusTcp(map(unit, *modbus)?),
+        (
+            RawTransport::Rtu,
+            Sections { unit_id: Some(unit), modbus: Some(modbus), line: Some(line), serial: Some(serial) },
+        ) => Transport::ModbusRtu(map(unit, *modbus)?, parse_line(doc, line)?, parse_serial(doc, serial)?),
+        (
+            RawTransport::RtuOverTcp,
+            Sections { unit_id: Some(unit), modbus: Some(modbus), line: Some(line), serial: None },
+        ) => Transport::ModbusRtuOverTcp(map(unit, *modbus)?, parse_line(doc, line)?),
+        (
+            RawTransport::SerialTable,
+            Sections { unit_id: Some(unit), modbus: None, line: Some(line), serial: Some(serial) },
+        ) => {
+            let unit = integer(doc, unit, "unit_id", 0..=255)? as u8;
+            Transport::SerialTable(unit, parse_line(doc, line)?, parse_serial(doc, serial)?)
         }
-        (RawTransport::Rtu, ..) => wrong("with [line] and [serial]"),
-        (RawTransport::RtuOverTcp, Some(line), None) => {
-            Ok(Transport::ModbusRtuOverTcp(parse_line(doc, line)?))
+        (kind, _) => {
+            let name = doc.text().get(transport.span()).unwrap_or("");
+            let (with, without): (Vec<_>, Vec<_>) = {
+                let wrong = sections.all().into_iter().filter(|(name, is)| kind.needs(name) != *is);
+                wrong.partition(|(_, is)| !*is)
+            };
+            let list = |what: &str, names: &[(&str, bool)]| {
+                let names: Vec<&str> = names.iter().map(|(name, _)| *name).collect();
+                if names.is_empty() { String::new() } else { format!("{what} {}", names.join(" and ")) }
+            };
+            let allowed = [list("with", &with), list("without", &without)];
+            let allowed: Vec<String> = allowed.into_iter().filter(|text| !text.is_empty()).collect();
+            return Err(doc.value_error(transport.span(), "transport", name, allowed.join(", ")));
         }
-        (RawTransport::RtuOverTcp, ..) => wrong("with [line], without [serial]"),
-    }
+    })
 }
 
 fn parse_line(doc: &Document, raw: &RawLine) -> Result<LineSettings, ConfigError> {
@@ -93,7 +157,8 @@ mod tests {
         let profile = parse(RTU).unwrap();
         let line = LineSettings { quiet: Duration::from_millis(500), echo: false };
         let serial = SerialSettings { baud: 19_200, parity: Parity::Even, stop_bits: 1, rs485: false };
-        assert_eq!(profile.transport, Transport::ModbusRtu(line, serial));
+        let Transport::ModbusRtu(_, found_line, found_serial) = profile.transport else { panic!() };
+        assert_eq!((found_line, found_serial), (line, serial));
     }
 
     #[test]

@@ -3,35 +3,39 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::registers::ModbusMap;
 use crate::config::{HOST_PORT, is_device, is_host_port};
 
 /// Which link leads to the machine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Transport {
     /// Modbus TCP. A stream: dropped on any doubt.
-    ModbusTcp,
+    ModbusTcp(ModbusMap),
     /// Modbus RTU on a serial port of this computer.
-    ModbusRtu(LineSettings, SerialSettings),
+    ModbusRtu(ModbusMap, LineSettings, SerialSettings),
     /// Modbus RTU's frames over TCP, as device servers for serial lines pass them on.
-    ModbusRtuOverTcp(LineSettings),
+    ModbusRtuOverTcp(ModbusMap, LineSettings),
+    /// The serial table protocol on a serial port, with the machine of this number.
+    SerialTable(u8, LineSettings, SerialSettings),
 }
 
 impl Transport {
     /// Whether an endpoint has the form that this transport takes; the machine is not looked up.
     pub fn takes(&self, endpoint: &str) -> bool {
         match self {
-            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => is_host_port(endpoint),
-            Transport::ModbusRtu(..) => is_device(endpoint),
+            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => is_host_port(endpoint),
+            Transport::ModbusRtu(..) | Transport::SerialTable(..) => is_device(endpoint),
         }
     }
 
     /// That form in words.
     pub fn form(&self) -> &'static str {
         match self {
-            Transport::ModbusTcp | Transport::ModbusRtuOverTcp(_) => HOST_PORT,
-            Transport::ModbusRtu(..) => {
+            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => HOST_PORT,
+            Transport::ModbusRtu(..) | Transport::SerialTable(..) => {
                 "the path of a serial port, best one that does not change: \"/dev/serial/by-id/...\""
             }
         }
@@ -40,8 +44,36 @@ impl Transport {
     /// What is known of the line, where there is one.
     pub fn line(&self) -> Option<&LineSettings> {
         match self {
-            Transport::ModbusTcp => None,
-            Transport::ModbusRtu(line, _) | Transport::ModbusRtuOverTcp(line) => Some(line),
+            Transport::ModbusTcp(_) => None,
+            Transport::ModbusRtu(_, line, _)
+            | Transport::ModbusRtuOverTcp(_, line)
+            | Transport::SerialTable(_, line, _) => Some(line),
+        }
+    }
+
+    /// The place of a byte in the staging area, for people.
+    pub fn staging_place(&self, byte: usize) -> String {
+        match self.modbus() {
+            Some(map) => format!("register {}", usize::from(map.registers.staging) + byte / 2),
+            None => format!("byte {byte}"),
+        }
+    }
+
+    /// The device's map, where it speaks Modbus.
+    pub fn modbus(&self) -> Option<&ModbusMap> {
+        match self {
+            Transport::ModbusTcp(map)
+            | Transport::ModbusRtu(map, ..)
+            | Transport::ModbusRtuOverTcp(map, _) => Some(map),
+            Transport::SerialTable(..) => None,
+        }
+    }
+
+    /// The port's settings, where it is one of this computer's.
+    pub fn serial(&self) -> Option<&SerialSettings> {
+        match self {
+            Transport::ModbusRtu(.., serial) | Transport::SerialTable(.., serial) => Some(serial),
+            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => None,
         }
     }
 }
@@ -81,7 +113,7 @@ impl SerialSettings {
 }
 
 /// Parity bit of a character.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Parity {
     /// No such bit.

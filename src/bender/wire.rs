@@ -4,7 +4,7 @@
 //! arranged by the profile's word order. A payload is
 //!
 //! ```text
-//! program      2 x program_registers bytes of ASCII, padded with zero
+//! program      program_bytes bytes of ASCII, padded with zero
 //! bend count   u16
 //! spare        u16, 0
 //! last length  i32
@@ -17,7 +17,6 @@
 use serde::Serialize;
 
 use super::limits::Reason;
-use super::plan::fields;
 use super::profile::{Profile, WordOrder};
 use crate::tube::{CommandRow, CommandTable};
 
@@ -128,7 +127,7 @@ pub fn encode_payload(
     let sign = if profile.table.rotation_reversed { -1.0 } else { 1.0 };
     let mut put =
         |bend: Option<usize>, what: &str, value: f64, resolution: f64| match counts(value, resolution) {
-            Some(count) => out.extend(profile.modbus.word_order.arrange(count.to_be_bytes())),
+            Some(count) => out.extend(profile.table.word_order.arrange(count.to_be_bytes())),
             None => reasons.push(Reason::new(
                 "not_encodable",
                 bend,
@@ -150,7 +149,7 @@ pub fn decode_payload(profile: &Profile, payload: &[u8]) -> Result<(String, Comm
     if payload.len() < header {
         return Err(format!("a payload has at least {header} bytes, found {}", payload.len()));
     }
-    let name = 2 * usize::from(profile.table.program_registers);
+    let name = profile.table.program_bytes;
     let count = usize::from(u16::from_be_bytes([payload[name], payload[name + 1]]));
     let expected = header + count * Profile::ROW_BYTES;
     if payload.len() != expected {
@@ -158,7 +157,7 @@ pub fn decode_payload(profile: &Profile, payload: &[u8]) -> Result<(String, Comm
     }
     let (mm, deg) = (profile.table.length_resolution_mm, profile.table.angle_resolution_deg);
     let sign = if profile.table.rotation_reversed { -1.0 } else { 1.0 };
-    let order = profile.modbus.word_order;
+    let order = profile.table.word_order;
     let value = |at: usize, resolution: f64| f64::from(u32_at(order, payload, at) as i32) * resolution;
     let row = |i: usize| {
         let at = header + i * Profile::ROW_BYTES;
@@ -186,58 +185,30 @@ pub fn staging_image(profile: &Profile, staged: &Staged) -> Vec<u8> {
 
 /// What is written to the commit word for this table: revision, CRC.
 pub fn commit_image(profile: &Profile, id: TableId) -> Vec<u8> {
-    let order = profile.modbus.word_order;
+    let order = profile.table.word_order;
     [order.arrange(id.revision.to_be_bytes()), order.arrange(id.crc.to_be_bytes())].concat()
 }
 
-/// First address and number of registers of the status.
-pub fn status_span(profile: &Profile) -> (u16, u16) {
-    let fields = fields(profile);
-    let first = fields.iter().map(|f| f.address).min().unwrap_or(0);
-    let end = fields.iter().map(|f| u32::from(f.address) + u32::from(f.registers)).max().unwrap_or(0);
-    (first, (end - u32::from(first)) as u16)
-}
-
-/// The status from the bytes of [`status_span`]; an error names the constant that is wrong.
-pub fn decode_status(profile: &Profile, bytes: &[u8]) -> Result<Status, String> {
-    let (first, count) = status_span(profile);
-    if bytes.len() != 2 * usize::from(count) {
-        return Err(format!("a status has {count} registers, found {}", bytes.len() / 2));
-    }
-    let (r, order) = (&profile.registers, profile.modbus.word_order);
-    let at = |address: u16| 2 * usize::from(address - first);
-    let long = |address: u16| u32_at(order, bytes, at(address));
-    let word = |address: u16| u16::from_be_bytes([bytes[at(address)], bytes[at(address) + 1]]);
-    if long(r.identification) != profile.identification {
+/// Whether this is the machine that it should be: its two constants, and where they were found. An error names the one that is
+/// wrong.
+pub(super) fn check_constants(
+    profile: &Profile,
+    (at, identification): (&str, u32),
+    (layout_at, layout): (&str, u16),
+) -> Result<(), String> {
+    let Profile { name, identification: expected, layout: expected_layout, .. } = profile;
+    if identification != *expected {
         return Err(format!(
-            "register {} holds 0x{:08X} where profile {:?} expects 0x{:08X}: not this machine, or another word \
-             order or address base",
-            r.identification,
-            long(r.identification),
-            profile.name,
-            profile.identification
+            "{at} holds 0x{identification:08X} where profile {name:?} expects 0x{expected:08X}: not this machine, or another word \
+             order or address base"
         ));
     }
-    if word(r.layout) != profile.layout {
+    if layout != *expected_layout {
         return Err(format!(
-            "register {} says layout {}, profile {:?} is for layout {}",
-            r.layout,
-            word(r.layout),
-            profile.name,
-            profile.layout
+            "{layout_at} says layout {layout}, profile {name:?} is for layout {expected_layout}"
         ));
     }
-    let program = at(r.program)..at(r.program) + 2 * usize::from(profile.table.program_registers);
-    Ok(Status {
-        heartbeat: word(r.heartbeat),
-        state: word(r.state),
-        program: text_of(&bytes[program]),
-        bend_count: word(r.bend_count),
-        active: TableId { revision: long(r.active_revision), crc: long(r.active_crc) },
-        ack_revision: long(r.ack_revision),
-        ack: Ack::from_code(word(r.ack_code)),
-        pending: TableId { revision: long(r.commit), crc: long(r.commit + 2) },
-    })
+    Ok(())
 }
 
 /// The value in whole steps, if an i32 can hold it.
@@ -246,7 +217,7 @@ pub(super) fn counts(value: f64, resolution: f64) -> Option<i32> {
     (steps.abs() <= f64::from(i32::MAX)).then_some(steps as i32)
 }
 
-fn u32_at(order: WordOrder, bytes: &[u8], at: usize) -> u32 {
+pub(super) fn u32_at(order: WordOrder, bytes: &[u8], at: usize) -> u32 {
     u32::from_be_bytes(order.arrange([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]))
 }
 
@@ -256,7 +227,7 @@ pub fn check_program(profile: &Profile, program: &str) -> Result<(), Reason> {
 }
 
 fn program_bytes(profile: &Profile, program: &str) -> Result<Vec<u8>, Reason> {
-    let longest = 2 * usize::from(profile.table.program_registers);
+    let longest = profile.table.program_bytes;
     let printable = |b: u8| b == b' ' || b.is_ascii_graphic();
     if program.trim_matches(' ').is_empty() || program.len() > longest || !program.bytes().all(printable) {
         let text = format!("program name {program:?}, allowed are 1 to {longest} ASCII characters");
@@ -268,7 +239,7 @@ fn program_bytes(profile: &Profile, program: &str) -> Result<Vec<u8>, Reason> {
 }
 
 /// Up to the first zero, without the blanks with which some controllers pad; what is not ASCII becomes '?'.
-fn text_of(bytes: &[u8]) -> String {
+pub(super) fn text_of(bytes: &[u8]) -> String {
     let used = bytes.split(|b| *b == 0).next().unwrap_or(&[]);
     let character = |b: &u8| if *b == b' ' || b.is_ascii_graphic() { char::from(*b) } else { '?' };
     used.iter().map(character).collect::<String>().trim_end_matches(' ').to_owned()
@@ -316,7 +287,7 @@ mod tests {
             (WordOrder::Badc, [1, 0, 0xC0, 0xD4]),
             (WordOrder::Dcba, [0xC0, 0xD4, 1, 0]),
         ] {
-            p.modbus.word_order = order;
+            p.table.word_order = order;
             let row = CommandRow { length_mm: 1200.0, rotation_rad: 0.0, angle_rad: 0.0 };
             let one = CommandTable { bends: vec![row], last_length_mm: 0.0 };
             let payload = encode_payload(&p, "A", &one).unwrap();
@@ -352,22 +323,6 @@ mod tests {
         assert!(encode_payload(&profile(), &"x".repeat(32), &table()).is_ok());
     }
 
-    #[test]
-    fn a_foreign_constant_is_named() {
-        let p = profile();
-        let (_, count) = status_span(&p);
-        assert_eq!(status_span(&p), (0, 36));
-        let mut bytes = vec![0; 2 * usize::from(count)];
-        assert!(decode_status(&p, &bytes).unwrap_err().contains("register 0 holds 0x00000000"));
-        bytes[..4].copy_from_slice(b"NDBE");
-        assert!(decode_status(&p, &bytes).unwrap_err().contains("word order"));
-        bytes[..4].copy_from_slice(b"BEND");
-        assert!(decode_status(&p, &bytes).unwrap_err().contains("register 2 says layout 0"));
-        bytes[5] = 1;
-        assert_eq!(decode_status(&p, &bytes).unwrap().active, TableId::default());
-        assert!(decode_status(&p, &bytes[2..]).is_err());
-    }
-
     proptest! {
         #[test]
         fn a_table_comes_back_within_half_a_step(
@@ -378,7 +333,7 @@ mod tests {
         ) {
             let mut p = profile();
             p.table.rotation_reversed = reversed;
-            p.modbus.word_order = order;
+            p.table.word_order = order;
             let bends = rows.iter().map(|(l, r, a): &(f64, f64, f64)| CommandRow {
                 length_mm: *l, rotation_rad: r.to_radians(), angle_rad: a.to_radians(),
             }).collect();
@@ -402,7 +357,7 @@ mod tests {
             if let Ok((_, table)) = decode_payload(&p, &bytes) {
                 prop_assert_eq!(bytes.len(), payload_bytes(&p, table.bends.len()));
             }
-            let _ = decode_status(&p, &bytes);
+            let _ = crate::bender::registers::decode_status(&p, p.transport.modbus().unwrap(), &bytes);
         }
     }
 }

@@ -3,7 +3,9 @@
 use std::fmt::Write as _;
 
 use crate::bender::plan::{self, Request};
-use crate::bender::{Parity, Profile, Transport, WordOrder, payload_bytes};
+use crate::bender::{
+    ModbusMap, Parity, Profile, SerialSettings, Transport, WordOrder, fields, payload_bytes,
+};
 
 /// All of it.
 pub fn of(profile: &Profile) -> String {
@@ -15,36 +17,44 @@ pub fn of(profile: &Profile) -> String {
 
 fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
     let bends = profile.limits.max_bends;
-    let (format, table) = (&profile.modbus, &profile.table);
+    let table = &profile.table;
     writeln!(out, "{}: {}", profile.name, profile.description)?;
-    writeln!(out, "  machine   {} unit {} at {}", transport(profile), profile.unit_id, profile.endpoint)?;
+    writeln!(out, "  machine   {} at {}", transport(profile), profile.endpoint)?;
     writeln!(
         out,
         "  numbers   32-bit values {} (A is the highest byte); {} mm and {} degrees a count; rotation {}",
-        order(format.word_order),
+        order(table.word_order),
         table.length_resolution_mm,
         table.angle_resolution_deg,
         if table.rotation_reversed { "left-handed about the feed" } else { "right-handed about the feed" }
     )?;
-    let bytes = payload_bytes(profile, bends);
-    writeln!(
-        out,
-        "  requests  read {} registers at most, write {}",
-        format.max_read_registers, format.max_write_registers
-    )?;
-    writeln!(out, "  table     up to {bends} bends, {bytes} bytes")?;
+    if let Some(map) = profile.transport.modbus() {
+        let (read, write) = (map.max_read_registers, map.max_write_registers);
+        writeln!(out, "  requests  read {read} registers at most, write {write}")?;
+    }
+    writeln!(out, "  table     up to {bends} bends, {} bytes", payload_bytes(profile, bends))?;
     writeln!(out, "  times     {}", times(profile))?;
-    writeln!(out, "\nvalues                     from 0        as 4xxxx")?;
-    for field in plan::fields(profile) {
-        let span = Request { writes: false, address: field.address, registers: field.registers };
-        writeln!(out, "  {:<22}   {}", field.name, registers(&span))?;
+    if let Some(map) = profile.transport.modbus() {
+        writeln!(out, "\nvalues                     from 0        as 4xxxx")?;
+        for field in fields(profile, map) {
+            let span = Request { writes: false, address: field.address, registers: field.registers };
+            writeln!(out, "  {:<22}   {}", field.name, registers(&span))?;
+        }
     }
     writeln!(out, "\nstate bits that must hold")?;
     for bit in &profile.state_bits {
         writeln!(out, "  bit {:<2} {:<20} {}", bit.bit, bit.name, if bit.must_be { "on" } else { "off" })?;
     }
+    match profile.transport.modbus() {
+        Some(map) => write_requests(out, profile, map),
+        None => Ok(()),
+    }
+}
+
+fn write_requests(out: &mut String, profile: &Profile, map: &ModbusMap) -> std::fmt::Result {
+    let bends = profile.limits.max_bends;
     writeln!(out, "\na delivery of {bends} bends     from 0        as 4xxxx")?;
-    for (number, step) in plan::delivery(profile, bends).iter().enumerate() {
+    for (number, step) in plan::delivery(profile, map, bends).iter().enumerate() {
         writeln!(out, "{} {}", number + 1, step.what)?;
         for request in &step.requests {
             let does = if request.writes { "write" } else { "read" };
@@ -65,18 +75,23 @@ fn registers(request: &Request) -> String {
 
 fn transport(profile: &Profile) -> String {
     match &profile.transport {
-        Transport::ModbusTcp => "Modbus TCP,".into(),
-        Transport::ModbusRtuOverTcp(_) => "Modbus RTU over TCP,".into(),
-        Transport::ModbusRtu(_, serial) => {
-            let parity = match serial.parity {
-                Parity::None => 'N',
-                Parity::Even => 'E',
-                Parity::Odd => 'O',
-            };
-            let rs485 = if serial.rs485 { ", RS-485 by the kernel" } else { "" };
-            format!("Modbus RTU, {} baud 8{parity}{}{rs485},", serial.baud, serial.stop_bits)
+        Transport::ModbusTcp(map) => format!("Modbus TCP, unit {}", map.unit_id),
+        Transport::ModbusRtuOverTcp(map, _) => format!("Modbus RTU over TCP, unit {}", map.unit_id),
+        Transport::ModbusRtu(map, _, port) => format!("Modbus RTU, {}, unit {}", serial(port), map.unit_id),
+        Transport::SerialTable(unit, _, port) => {
+            format!("serial table protocol, {}, unit {unit}", serial(port))
         }
     }
+}
+
+fn serial(serial: &SerialSettings) -> String {
+    let parity = match serial.parity {
+        Parity::None => 'N',
+        Parity::Even => 'E',
+        Parity::Odd => 'O',
+    };
+    let rs485 = if serial.rs485 { ", RS-485 by the kernel" } else { "" };
+    format!("{} baud 8{parity}{}{rs485}", serial.baud, serial.stop_bits)
 }
 
 fn order(order: WordOrder) -> &'static str {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Outcome as Exit, push_text, say};
 use crate::bender::{
-    ActiveTable, Bender as _, Intent, IntentLog as _, Job, ModbusLink, Outcome, Profile, Reason, TableId,
+    ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Outcome, Profile, Reason, TableId,
     check_program, deliver, gate, prepare,
 };
 use crate::cell::JournalledIntents;
@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
     let job = Job { program, table, expected_active: None };
-    let mut link = ModbusLink::new(profile, endpoint)?;
+    let mut link = Link::new(profile, endpoint)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
     finish(args, &report)
@@ -145,7 +145,7 @@ fn finish(args: &Args, report: &Report) -> anyhow::Result<Exit> {
 
 async fn push(
     args: &Args,
-    link: &mut ModbusLink,
+    link: &mut Link,
     mut job: Job,
     journal: Option<&mut Journal>,
     mut report: Report,
@@ -190,7 +190,7 @@ async fn push(
 }
 
 /// Limits first, then the machine: what breaks a limit needs no connection.
-async fn look(link: &mut ModbusLink, job: &Job) -> Result<ActiveTable, Outcome> {
+async fn look(link: &mut Link, job: &Job) -> Result<ActiveTable, Outcome> {
     prepare(link.profile(), job).map_err(|reasons| Outcome::Rejected { reasons })?;
     link.read_active().await.map_err(|error| Outcome::NotApplied { why: error.to_string() })
 }

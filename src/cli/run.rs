@@ -15,7 +15,7 @@ use tokio::task::JoinSet;
 use super::Outcome;
 use super::check::load;
 use crate::arm::WatchedFolder;
-use crate::bender::ModbusLink;
+use crate::bender::Link;
 use crate::cell::{Chain, Command, Driver, Notice, Setup};
 use crate::journal::Journal;
 
@@ -76,7 +76,7 @@ impl Daemon {
     async fn start(&mut self, setup: Setup, journal: &std::path::Path) -> anyhow::Result<()> {
         let name = setup.identity.name.clone();
         let source = WatchedFolder::open(setup.folder).await.with_context(|| format!("cell {name}"))?;
-        let bender = ModbusLink::new(setup.profile, setup.address)?;
+        let bender = Link::new(setup.profile, setup.address)?;
         let journals = [Journal::open(journal)?, Journal::open(journal)?];
         let driver: Driver<_, Chain> = Driver::new(setup.identity, bender, source, setup.chain, journals)?;
         let (commands, receiver) = mpsc::channel(8);

@@ -35,7 +35,7 @@ pub struct Args {
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     let profile = Profile::load(&args.profile)?;
-    let longest = 2 * usize::from(profile.table.program_registers);
+    let longest = profile.table.program_bytes;
     if args.program.is_empty() || args.program.len() > longest || !args.program.is_ascii() {
         bail!("--program {:?}: allowed are 1 to {longest} ASCII characters", args.program);
     }

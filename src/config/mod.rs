@@ -3,12 +3,14 @@
 //! A side door of the house: files come in here, checked values go to the rooms. [`Document`] is the one way
 //! in for every TOML file of the project (machine profiles too).
 
+mod at;
 mod daemon;
 mod document;
 mod materials;
 mod part;
 mod tables;
 
+pub use at::At;
 pub use daemon::{
     CellConfig, DaemonConfig, HOST_PORT, Mode, ScanUnit, is_device, is_host_port, load_daemon, parse_daemon,
 };

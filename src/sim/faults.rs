@@ -154,34 +154,42 @@ impl WireFaults {
         })
     }
 
-    /// The bytes that arrive of an answer.
-    pub fn damage(&mut self, fault: ReplyFault, mut bytes: Vec<u8>) -> Vec<u8> {
+    /// A number below `below`, by chance.
+    pub fn chance(&mut self, below: usize) -> usize {
+        self.rng.random_range(0..below.max(1))
+    }
+}
+
+/// What comes over a port in one piece, and what arrives of it when it is damaged.
+pub trait Damaged: Sized {
+    /// The pieces that arrive.
+    fn damaged(self, fault: ReplyFault, faults: &mut WireFaults) -> Vec<Self>;
+}
+
+impl Damaged for Vec<u8> {
+    fn damaged(mut self, fault: ReplyFault, faults: &mut WireFaults) -> Vec<Vec<u8>> {
         match fault {
-            ReplyFault::Lost => Vec::new(),
-            ReplyFault::Late { .. } => bytes,
-            ReplyFault::Twice => bytes.repeat(2),
-            ReplyFault::Truncated => {
-                bytes.truncate(self.rng.random_range(0..bytes.len().max(1)));
-                bytes
-            }
+            ReplyFault::Lost => return Vec::new(),
+            ReplyFault::Late { .. } => {}
+            ReplyFault::Twice => self = self.repeat(2),
+            ReplyFault::Truncated => self.truncate(faults.chance(self.len())),
             ReplyFault::Corrupted => {
-                let bit = self.rng.random_range(0..(8 * bytes.len()).max(1));
-                if let Some(byte) = bytes.get_mut(bit / 8) {
+                let bit = faults.chance(8 * self.len());
+                if let Some(byte) = self.get_mut(bit / 8) {
                     *byte ^= 1 << (bit % 8);
                 }
-                bytes
             }
             ReplyFault::WrongUnit => {
-                if let Some(unit) = bytes.first_mut() {
+                if let Some(unit) = self.first_mut() {
                     *unit = unit.wrapping_add(1);
                 }
-                bytes
             }
             ReplyFault::Garbage => {
-                let count = self.rng.random_range(1..20);
-                let garbage: Vec<u8> = (0..count).map(|_| self.rng.random_range(0..=255)).collect();
-                [garbage, bytes].concat()
+                let count = 1 + faults.chance(19);
+                let garbage: Vec<u8> = (0..count).map(|_| faults.chance(256) as u8).collect();
+                self = [garbage, self].concat();
             }
         }
+        vec![self]
     }
 }

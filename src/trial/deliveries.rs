@@ -14,14 +14,13 @@ use tokio::sync::mpsc;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, LogError, ModbusLink, Outcome, Profile, TableId, Wire, crc_of,
-    deliver, encode_payload,
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Profile, TableId, Wire, crc_of, deliver,
+    encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
-use crate::sim::door::Door;
+use crate::sim::door::{Door, Speech};
 use crate::sim::faults::WireFaults;
-use crate::sim::frames::Framing;
 use crate::sim::pty::Kept;
 use crate::tube::{CommandRow, CommandTable};
 
@@ -94,20 +93,19 @@ pub struct Ends {
     /// Where the machine is reached.
     pub door: Door,
     /// What reaches it.
-    pub link: ModbusLink,
+    pub link: Link,
 }
 
 /// Wires in memory, as many as are opened.
 pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
-    let framing = if profile.transport.line().is_some() { Framing::Rtu } else { Framing::Tcp };
     let (made, wires) = mpsc::unbounded_channel();
     let open = move || {
         let (here, there) = tokio::io::duplex(WIRE_BYTES);
         made.send(there).map_err(|_| std::io::Error::other("the machine is gone"))?;
         Ok(Box::new(here) as Box<dyn Wire>)
     };
-    let link = ModbusLink::over(profile.clone(), "a wire in memory", Box::new(open))?;
-    Ok(Ends { door: Door::Memory(framing, wires), link })
+    let link = Link::over(profile.clone(), "a wire in memory", Box::new(open))?;
+    Ok(Ends { door: Door::Memory(Speech::of(&profile.transport), wires), link })
 }
 
 /// The transport's own: a socket, or a pseudo terminal of this name.
@@ -115,7 +113,7 @@ pub async fn real(profile: &Profile, terminal: &str) -> Result<(Ends, Option<Kep
     let is_serial = profile.transport.takes(terminal);
     let (door, kept) =
         Door::open(&profile.transport, if is_serial { terminal } else { "127.0.0.1:0" }).await?;
-    let link = ModbusLink::new(profile.clone(), door.address()?)?;
+    let link = Link::new(profile.clone(), door.address()?)?;
     Ok((Ends { door, link }, kept))
 }
 
@@ -203,7 +201,7 @@ impl Found {
     }
 
     /// What became of it; of what is unknown, by a later look.
-    async fn ending(&self, link: &mut ModbusLink) -> Result<Ending, String> {
+    async fn ending(&self, link: &mut Link) -> Result<Ending, String> {
         Ok(match &self.outcome {
             Outcome::Applied(_) | Outcome::AlreadyActive(_) => Ending::Applied,
             Outcome::Rejected { .. } => Ending::Rejected,

@@ -8,7 +8,7 @@ use super::record::PartRecord;
 use super::shop::Shop;
 use super::{TrialError, story};
 use crate::arm::{FolderSettings, WatchedFolder};
-use crate::bender::{ModbusLink, Profile};
+use crate::bender::{Link, Profile};
 use crate::cell::{Chain, Command, Decided, Driver, Dwell, Identity, Notice, State};
 use crate::cloud::Unit;
 use crate::config::Mode;
@@ -66,7 +66,7 @@ pub async fn run(demo: &Demo, say: &mut (dyn FnMut(&str) + Send)) -> Result<Demo
         mode: Mode::Automatic,
         dwell: Dwell::default(),
     };
-    let link = ModbusLink::new(demo.profile.clone(), shop.address())?;
+    let link = Link::new(demo.profile.clone(), shop.address())?;
     let chain = Chain::new(CELL, demo.nominal.clone(), Unit::Millimetre, demo.profile.limits.clone());
     let journals = [Journal::open(&journal)?, Journal::open(&journal)?];
     let driver = Driver::new(identity, link, source, chain, journals)?;

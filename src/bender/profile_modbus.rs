@@ -1,0 +1,198 @@
+//! The part of a profile file that a Modbus device needs: its unit, how much fits into a request, where each value is. No two areas
+//! may overlap, and one read must cover the status.
+//!
+//! Under `profile_file`.
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::profile::{Profile, WordOrder};
+use super::profile_file::integer;
+use super::registers::{ModbusMap, Registers};
+use crate::config::{At, ConfigError, Document};
+
+#[derive(Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RawModbus {
+    /// Of 32-bit values, A being the highest byte.
+    pub word_order: RawWordOrder,
+    max_read_registers: At<i64>,
+    max_write_registers: At<i64>,
+}
+
+#[derive(Clone, Copy, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RawWordOrder {
+    Abcd,
+    Cdab,
+    Badc,
+    Dcba,
+}
+
+#[derive(Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RawRegisters {
+    identification: At<i64>,
+    layout: At<i64>,
+    heartbeat: At<i64>,
+    state: At<i64>,
+    bend_count: At<i64>,
+    program: At<i64>,
+    active_revision: At<i64>,
+    active_crc: At<i64>,
+    ack_revision: At<i64>,
+    ack_code: At<i64>,
+    commit: At<i64>,
+    staging: At<i64>,
+    active: At<i64>,
+}
+
+impl From<RawWordOrder> for WordOrder {
+    fn from(raw: RawWordOrder) -> WordOrder {
+        match raw {
+            RawWordOrder::Abcd => WordOrder::Abcd,
+            RawWordOrder::Cdab => WordOrder::Cdab,
+            RawWordOrder::Badc => WordOrder::Badc,
+            RawWordOrder::Dcba => WordOrder::Dcba,
+        }
+    }
+}
+
+/// The device; whether its areas fit is known when the whole profile is ([`check_areas`]).
+pub fn parse_modbus(
+    doc: &Document,
+    unit_id: &At<i64>,
+    raw: &RawModbus,
+    registers: &RawRegisters,
+) -> Result<ModbusMap, ConfigError> {
+    // Every 32-bit value lies at an even distance from its area's start, so an even limit never splits one.
+    let even = |value: &At<i64>, key, max| Ok(integer(doc, value, key, 4..=max)? as u16 & !1);
+    Ok(ModbusMap {
+        unit_id: integer(doc, unit_id, "unit_id", 0..=255)? as u8,
+        max_read_registers: even(&raw.max_read_registers, "modbus.max_read_registers", 125)?,
+        max_write_registers: even(&raw.max_write_registers, "modbus.max_write_registers", 123)?,
+        registers: parse_registers(doc, registers)?,
+    })
+}
+
+fn parse_registers(doc: &Document, raw: &RawRegisters) -> Result<Registers, ConfigError> {
+    let address = |value: &At<i64>, key: &str| -> Result<u16, ConfigError> {
+        Ok(integer(doc, value, &format!("registers.{key}"), 0..=0xffff)? as u16)
+    };
+    Ok(Registers {
+        identification: address(&raw.identification, "identification")?,
+        layout: address(&raw.layout, "layout")?,
+        heartbeat: address(&raw.heartbeat, "heartbeat")?,
+        state: address(&raw.state, "state")?,
+        bend_count: address(&raw.bend_count, "bend_count")?,
+        program: address(&raw.program, "program")?,
+        active_revision: address(&raw.active_revision, "active_revision")?,
+        active_crc: address(&raw.active_crc, "active_crc")?,
+        ack_revision: address(&raw.ack_revision, "ack_revision")?,
+        ack_code: address(&raw.ack_code, "ack_code")?,
+        commit: address(&raw.commit, "commit")?,
+        staging: address(&raw.staging, "staging")?,
+        active: address(&raw.active, "active")?,
+    })
+}
+
+/// One group of registers: the address as written in the file, its key, how many.
+struct Area<'a> {
+    address: &'a At<i64>,
+    key: &'static str,
+    registers: usize,
+}
+
+impl Area<'_> {
+    fn start(&self) -> i64 {
+        *self.address.get_ref()
+    }
+
+    fn end(&self) -> i64 {
+        self.start() + self.registers as i64
+    }
+
+    fn complaint(&self, doc: &Document, allowed: String) -> ConfigError {
+        doc.value_error(self.address.span(), &format!("registers.{}", self.key), self.start(), allowed)
+    }
+}
+
+fn areas<'a>(r: &'a RawRegisters, profile: &Profile) -> Vec<Area<'a>> {
+    let payload = (profile.payload_header_bytes() + profile.limits.max_bends * Profile::ROW_BYTES) / 2;
+    let area = |address, key, registers| Area { address, key, registers };
+    vec![
+        area(&r.identification, "identification", 2),
+        area(&r.layout, "layout", 1),
+        area(&r.heartbeat, "heartbeat", 1),
+        area(&r.state, "state", 1),
+        area(&r.bend_count, "bend_count", 1),
+        area(&r.program, "program", profile.table.program_bytes / 2),
+        area(&r.active_revision, "active_revision", 2),
+        area(&r.active_crc, "active_crc", 2),
+        area(&r.ack_revision, "ack_revision", 2),
+        area(&r.ack_code, "ack_code", 1),
+        area(&r.commit, "commit", 4),
+        area(&r.staging, "staging", 4 + payload),
+        area(&r.active, "active", payload),
+    ]
+}
+
+/// No two areas overlap, all fit, and one read covers the status.
+pub fn check_areas(
+    doc: &Document,
+    raw: &RawRegisters,
+    profile: &Profile,
+    map: &ModbusMap,
+) -> Result<(), ConfigError> {
+    let mut areas = areas(raw, profile);
+    areas.sort_by_key(Area::start);
+    if let Some(area) = areas.iter().find(|a| a.end() > 0x10000) {
+        let allowed = format!("at most {}: it takes {} registers", 0x10000 - area.registers, area.registers);
+        return Err(area.complaint(doc, allowed));
+    }
+    if let Some((before, area)) = areas.iter().zip(areas.iter().skip(1)).find(|(a, b)| a.end() > b.start()) {
+        return Err(area.complaint(doc, format!("{} or more: {} ends there", before.end(), before.key)));
+    }
+    let mut status = areas.iter().filter(|a| !matches!(a.key, "staging" | "active"));
+    let first = status.clone().map(Area::start).min().unwrap_or(0);
+    let most = map.max_read_registers;
+    match status.find(|a| a.end() - first > i64::from(most)) {
+        Some(area) => {
+            let allowed = format!(
+                "below {}: one read of {most} registers covers the whole status, so that it is of one moment",
+                first + i64::from(most) - area.registers as i64 + 1
+            );
+            Err(area.complaint(doc, allowed))
+        }
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = include_str!("../../protocols/reference-modbus.toml");
+
+    fn parse(text: &str) -> Result<Profile, String> {
+        Profile::parse(&Document::new("p.toml", text)).map_err(|e| e.to_string())
+    }
+
+    fn complaint(from: &str, to: &str) -> String {
+        assert!(TEXT.contains(from), "the shipped profile no longer contains {from:?}");
+        parse(&TEXT.replacen(from, to, 1)).unwrap_err()
+    }
+
+    #[test]
+    fn areas_that_overlap_or_overflow_are_refused_and_the_neighbour_is_not() {
+        assert!(complaint("commit = 32", "commit = 29").contains("commit = 29, allowed is 30 or more"));
+        assert!(
+            complaint("active = 2000", "active = 1263").contains("active = 1263, allowed is 1264 or more")
+        );
+        assert!(parse(&TEXT.replace("active = 2000", "active = 1264")).is_ok());
+        assert!(complaint("active = 2000", "active = 65277").contains("at most 65276"));
+        assert!(parse(&TEXT.replace("active = 2000", "active = 65276")).is_ok());
+        assert!(complaint("commit = 32", "commit = 121").contains("one read of 124 registers"));
+        assert!(parse(&TEXT.replace("commit = 32", "commit = 120")).is_ok());
+    }
+}

@@ -1,0 +1,151 @@
+//! Puts a station on a port: what arrives is heard, what it answers goes out, with the faults of the wire.
+
+use std::io;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+
+use super::bender::MachineModel;
+use super::faults::{Damaged, Fault, ReplyFault, WireFaults};
+use super::station::{Controller, Station};
+use crate::bender::Port;
+
+/// Cycle of the simulated controller's program.
+pub const CYCLE: Duration = Duration::from_millis(10);
+
+/// Silence after which a piece of a frame is given up.
+const GIVEN_UP: Duration = Duration::from_millis(20);
+
+/// What all links to one machine share.
+#[derive(Debug)]
+pub struct Shared {
+    /// The machine.
+    pub model: Mutex<MachineModel>,
+    /// A way to misbehave.
+    pub fault: Option<Fault>,
+    /// Answers nothing any more.
+    pub mute: Mutex<bool>,
+    /// What happens to answers on the wire.
+    pub wire_faults: Mutex<Option<WireFaults>>,
+}
+
+/// A panic elsewhere leaves the machine as it is; it keeps answering, as a real one would.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A wire of bytes.
+pub struct WirePort<W>(pub W);
+
+impl<W: AsyncRead + AsyncWrite + Unpin + Send> Port for WirePort<W> {
+    type Piece = Vec<u8>;
+
+    async fn discard(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+
+    async fn send(&mut self, piece: Vec<u8>) -> io::Result<()> {
+        self.0.write_all(&piece).await?;
+        self.0.flush().await
+    }
+
+    async fn receive(&mut self) -> io::Result<Vec<u8>> {
+        let mut bytes = [0; 512];
+        match self.0.read(&mut bytes).await? {
+            0 => Err(io::ErrorKind::UnexpectedEof.into()),
+            count => Ok(bytes[..count].to_vec()),
+        }
+    }
+}
+
+/// Until the port is closed or the machine hangs up.
+pub async fn serve<P, S>(mut port: P, mut station: S, shared: &Shared)
+where
+    P: Port,
+    P::Piece: Damaged,
+    S: Station<Piece = P::Piece>,
+{
+    let mut cycle = tokio::time::interval(CYCLE);
+    let mut quiet = Duration::ZERO;
+    loop {
+        let received = tokio::select! {
+            received = port.receive() => Some(received),
+            _ = cycle.tick() => None,
+        };
+        match received {
+            Some(Ok(piece)) => {
+                quiet = Duration::ZERO;
+                let (answers, hangs_up) = shared.attend(|controller| station.hear(piece, controller));
+                if hangs_up || shared.answer(&mut port, answers).await.is_err() {
+                    return;
+                }
+            }
+            Some(Err(_)) => return,
+            None => {
+                quiet += CYCLE;
+                if quiet > GIVEN_UP {
+                    station.silence();
+                }
+                let (pieces, _) = shared.attend(|controller| station.cycle(controller));
+                for piece in pieces {
+                    let _ = shared.damaged(&mut port, piece, false).await; // the bus may be away for a while
+                }
+            }
+        }
+    }
+}
+
+impl Shared {
+    /// Lets a station act; and whether the machine hangs up.
+    fn attend<T>(&self, act: impl FnOnce(&mut Controller<'_>) -> T) -> (T, bool) {
+        let (mut model, mut mute) = (lock(&self.model), lock(&self.mute));
+        let mut controller =
+            Controller { model: &mut model, fault: self.fault, mute: &mut mute, hangs_up: false };
+        let result = act(&mut controller);
+        (result, controller.hangs_up)
+    }
+
+    async fn answer<P>(&self, port: &mut P, answers: Vec<P::Piece>) -> io::Result<()>
+    where
+        P: Port,
+        P::Piece: Damaged,
+    {
+        for answer in answers {
+            if let Some(Fault::Late { ms }) = self.fault {
+                tokio::time::sleep(Duration::from_millis(ms)).await;
+            }
+            self.damaged(port, answer, true).await?;
+        }
+        Ok(())
+    }
+
+    /// Sends what arrives of a piece, when it does.
+    async fn damaged<P>(&self, port: &mut P, piece: P::Piece, takes_time: bool) -> io::Result<()>
+    where
+        P: Port,
+        P::Piece: Damaged,
+    {
+        let (arriving, ms) = {
+            let mut faults = lock(&self.wire_faults);
+            match faults.as_mut() {
+                None => (vec![piece], 0),
+                Some(faults) => {
+                    let usual_ms = if takes_time { faults.usual_ms() } else { 0 };
+                    match faults.fault() {
+                        None => (vec![piece], usual_ms),
+                        Some(ReplyFault::Late { ms }) => (vec![piece], usual_ms + ms),
+                        Some(fault) => (piece.damaged(fault, faults), usual_ms),
+                    }
+                }
+            }
+        };
+        if ms > 0 {
+            tokio::time::sleep(Duration::from_millis(ms)).await;
+        }
+        for piece in arriving {
+            port.send(piece).await?;
+        }
+        Ok(())
+    }
+}
