@@ -1,10 +1,11 @@
-"""A bender's side of a delivery without a link: its areas as byte images, and what becomes of a commit.
+"""A bender's side of a delivery without a link: tables and areas as byte images, and what becomes of a commit.
 
 Written from protocols/reference-modbus.md alone, no code of benderd's. modbus_bender.py and can/canopen_bender.py put
 it on a link. Its own limit of the angle is narrower than the profile's, so that a whole delivery can end in code 8.
 Run as a program, it goes through every code.
 """
 
+import csv
 import struct
 import zlib
 
@@ -25,6 +26,20 @@ def payload_of(area):
     bends = HEAD.unpack_from(area)[1]
     size = HEAD.size + bends * ROW.size
     return bytes(area[:size]) if bends <= BENDS_MAX and size <= len(area) else None
+
+
+def table_of(path):
+    """A CSV table in counts: the last length, and length, rotation, angle of each bend."""
+    with open(path, newline="", encoding="utf-8") as file:
+        *rows, tail = list(csv.DictReader(file))
+    columns = (("length_mm", 100), ("rotation_deg", 1000), ("angle_deg", 1000))
+    return round(float(tail["length_mm"]) * 100), [tuple(round(float(r[c]) * n) for c, n in columns) for r in rows]
+
+
+def payload_for(program, table):
+    """The payload of a table in counts, as the contract lays it out."""
+    last, rows = table
+    return HEAD.pack(program.encode("ascii"), len(rows), 0, last) + b"".join(ROW.pack(*row) for row in rows)
 
 
 class Machine:
@@ -79,8 +94,9 @@ class Machine:
 
 
 def main():
-    good = (b"P1", 1, 0, 5000), (12000, 0, 90000)
-    table = lambda head=good[0], row=good[1]: HEAD.pack(*head) + ROW.pack(*row) * head[1]
+    def table(head=(b"P1", 1, 0, 5000), row=(12000, 0, 90000)):
+        return HEAD.pack(*head) + ROW.pack(*row) * head[1]
+
     for expected, payload, change in [
         (1, table(), {}),
         (2, table(), {"commit": (1, 5)}),

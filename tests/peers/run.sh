@@ -14,70 +14,25 @@ for needed in "$python" mbpoll socat; do
     fi
 done
 work=$(mktemp -d)
-bender=
 line=
 finish() {
-    for pid in $bender $line; do
+    for pid in ${bender-} $line; do
         kill "$pid" 2>/dev/null || true
     done
     rm -rf "$work"
 }
 trap finish EXIT
 cd "$work"
-
-# start COMMAND...: a bender; its first line in $said, the port in it, if any, in $port, the rest in the file bender.log.
-start() {
-    : >bender.log
-    "$@" >bender.log &
-    bender=$!
-    local deadline=$((SECONDS + 20))
-    until grep -q listens bender.log; do
-        if [ "$SECONDS" -ge "$deadline" ] || ! kill -0 "$bender" 2>/dev/null; then
-            echo "FAILED: did not come up: $*"
-            exit 1
-        fi
-        sleep 0.05
-    done
-    said=$(head -n 1 bender.log)
-    port=$(sed -nE 's/.* listens on [0-9.]+:([0-9]+).*/\1/p' <<<"$said")
-    echo "$said"
-}
-
-simulated() { # PROFILE ADDRESS
-    start "$binary" simulate bender --profile "$1" --on "$2" --program bracket --bends 3
-}
+# shellcheck disable=SC1091 # checked by itself
+source "$here/common.sh"
 
 pymodbus() { # --port PORT | --serial PATH
     start "$python" "$here/modbus_bender.py" --program bracket --bends 3 "$@"
 }
 
-stop() {
-    kill "$bender"
-    wait "$bender" || true
-    bender=
-}
-
-# push TABLE PROFILE ADDRESS [OPTION...]: a delivery that must be applied.
-push() {
-    push_for bracket "$@" >pushed
-    grep '^done' pushed
-}
-
-push_for() { # PROGRAM TABLE PROFILE ADDRESS
-    "$binary" push "$2" --bender "$3" --on "$4" --program "$1" --journal journal.db
-}
-
-# refused WHY PROGRAM TABLE PROFILE ADDRESS: a delivery that must end with status 1 and say why.
-refused() {
-    local why=$1 status=0
-    shift
-    push_for "$@" >pushed 2>&1 || status=$?
-    if [ "$status" -ne 1 ] || ! grep -q "$why" pushed; then
-        echo "FAILED: status $status, expected 1 and \"$why\"; benderd said:"
-        cat pushed
-        exit 1
-    fi
-    echo "ok  refused: $(grep -m 1 "$why" pushed)"
+# The port in what a bender said.
+port() {
+    sed -nE 's/.* listens on ([0-9.]+):([0-9]+).*/\2/p' <<<"$said"
 }
 
 # polled NAME REVISION HOW...: mbpoll reads the active revision (register 24), then from register 2018 on the last
@@ -98,17 +53,8 @@ polled() {
     echo "ok  mbpoll over $name reads active revision and table: $found"
 }
 
-cat >first.csv <<'CSV'
-length_mm,rotation_deg,angle_deg,radius_mm
-120.25,0,92.125,50.8
-80.5,-60.5,181.25,50.8
-6000,180,0.001,50.8
-100.75,0,0,
-CSV
-sed -e 's/^120.25/33.33/' -e 's/92.125/93.5/' first.csv >second.csv
-sed -e 's/181.25/185.001/' first.csv >wide.csv # the profile takes 190 degrees, machine.py 185
-
 simulated reference-modbus 127.0.0.1:0
+port=$(port)
 push first.csv reference-modbus "127.0.0.1:$port"
 "$python" "$here/modbus_peer.py" "$port" first.csv bracket 1
 push second.csv reference-modbus "127.0.0.1:$port"
@@ -121,22 +67,13 @@ push second.csv reference-rtu "$work/line"
 polled RTU 1 -m rtu -b 19200 -P even "$work/line"
 stop
 
-# delivered NAME PROFILE ADDRESS HOW...: to pymodbus as the bender.
-delivered() {
-    local name=$1
-    push first.csv "$2" "$3"
-    push second.csv "$2" "$3"
-    refused "the machine has \"bracket\" loaded" other first.csv "$2" "$3"
-    refused "code 8" bracket wide.csv "$2" "$3"
-    shift 3
-    polled "$name to pymodbus" 2 "$@"
-    sed 1d bender.log
-}
-
 "$python" "$here/machine.py"
 pymodbus --port 0
-delivered TCP reference-modbus "127.0.0.1:$port" -m tcp -p "$port" 127.0.0.1
+port=$(port)
+delivered reference-modbus "127.0.0.1:$port"
+polled "TCP to pymodbus" 2 -m tcp -p "$port" 127.0.0.1
 "$python" "$here/modbus_peer.py" "$port" second.csv bracket 2
+sed 1d bender.log
 stop
 
 socat pty,raw,echo=0,link="$work/ours" pty,raw,echo=0,link="$work/theirs" &
@@ -146,7 +83,9 @@ until [ -e ours ] && [ -e theirs ]; do
     sleep 0.05
 done
 pymodbus --serial "$work/theirs"
-delivered RTU reference-rtu "$work/ours" -m rtu -b 19200 -P even "$work/ours"
+delivered reference-rtu "$work/ours"
+polled "RTU to pymodbus" 2 -m rtu -b 19200 -P even "$work/ours"
+sed 1d bender.log
 stop
 
 echo "peers: benderd's tables are found by pymodbus and mbpoll in the simulated bender, by mbpoll in pymodbus as the bender"
