@@ -23,7 +23,7 @@ finish() {
 }
 trap finish EXIT
 cd "$work"
-# shellcheck disable=SC1091 # checked by itself
+# shellcheck source=tests/peers/common.sh
 source "$here/common.sh"
 
 pymodbus() { # --port PORT | --serial PATH

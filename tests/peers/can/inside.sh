@@ -7,7 +7,7 @@ here=$(cd "$(dirname "$0")" && pwd)
 dbc=$here/../../../protocols/bender.dbc
 mkdir /run/peers
 cd /run/peers
-# shellcheck disable=SC1091 # checked by itself
+# shellcheck source=tests/peers/common.sh
 source "$here/../common.sh"
 
 for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan; do
