@@ -85,6 +85,8 @@ part release cargo build --locked --release
 part demo demo
 part "peers: install" bash tests/peers/install.sh
 part peers bash tests/peers/run.sh target/release/benderd
+part "can peers: install" bash tests/peers/can/install.sh
+part "can peers" bash tests/peers/can/run.sh target/release/benderd
 if [ "${FULL:-0}" = 1 ]; then
     part deny deny
     part "many property cases" env PROPTEST_CASES=2000 cargo test --locked

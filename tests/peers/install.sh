@@ -1,27 +1,29 @@
 #!/usr/bin/env bash
-# Installs what tests/peers/run.sh needs and this machine lacks: mbpoll (apt), pymodbus (pip, pinned, in a virtual
-# environment outside the clone). Does nothing when all is there.
+# Installs what tests/peers/run.sh needs and this machine lacks: mbpoll and socat (apt), pymodbus and pyserial (pip,
+# pinned, in a virtual environment outside the clone). Does nothing when all is there.
 set -euo pipefail
 pymodbus=3.16.1
+pyserial=3.5
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/benderd-tests
 venv=$cache/pymodbus-$pymodbus
 
-if command -v mbpoll >/dev/null; then
-    echo "mbpoll is there: $(command -v mbpoll)"
+if command -v mbpoll >/dev/null && command -v socat >/dev/null; then
+    echo "mbpoll and socat are there: $(command -v mbpoll socat | xargs)"
 else
     as_root=()
     if [ "$(id -u)" -ne 0 ]; then
         as_root=(sudo)
     fi
     "${as_root[@]}" apt-get update -qq
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq mbpoll
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq mbpoll socat
 fi
 
-if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c "import pymodbus; assert pymodbus.__version__ == '$pymodbus'" 2>/dev/null; then
-    echo "pymodbus $pymodbus is there: $venv"
+found=$("$venv/bin/python" -c "import pymodbus, serial; print(pymodbus.__version__, serial.__version__)" 2>/dev/null || true)
+if [ "$found" = "$pymodbus $pyserial" ]; then
+    echo "pymodbus $pymodbus and pyserial $pyserial are there: $venv"
 else
     mkdir -p "$cache"
     python3 -m venv --clear "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check "pymodbus==$pymodbus"
-    echo "pymodbus $pymodbus installed: $venv"
+    "$venv/bin/pip" install --quiet --disable-pip-version-check "pymodbus==$pymodbus" "pyserial==$pyserial"
+    echo "pymodbus $pymodbus and pyserial $pyserial installed: $venv"
 fi
