@@ -45,7 +45,7 @@ fn push_goes_on_when_nobody_reads_what_it_says() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let profile = Profile::load("reference-modbus").unwrap();
     let bender = runtime.block_on(async {
-        let (door, _) = Door::open(&profile.transport, "127.0.0.1:0").await.unwrap();
+        let (door, _) = Door::open(&profile, "127.0.0.1:0").await.unwrap();
         SimulatedBender::start(door, MachineModel::new(profile, "p1", 1), None, |_| ()).unwrap()
     });
     let folder = tempfile::tempdir().unwrap();

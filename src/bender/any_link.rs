@@ -1,6 +1,7 @@
 //! The link that a profile asks for.
 
 use super::contact::RulesError;
+use super::folder::SharedFolder;
 use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus::ModbusLink;
 use super::open::Opener;
@@ -13,9 +14,11 @@ use super::wire::{Staged, Status, TableId};
 /// A link of any kind.
 pub enum Link {
     /// Modbus, whatever it goes over.
-    Modbus(ModbusLink),
+    Modbus(Box<ModbusLink>),
     /// A serial port with a protocol of its own.
-    Serial(TableLink<SerialTable>),
+    Serial(Box<TableLink<SerialTable>>),
+    /// A folder that both reach.
+    Folder(Box<TableLink<SharedFolder>>),
 }
 
 impl Link {
@@ -35,11 +38,15 @@ impl Link {
             | Transport::ModbusRtu(map, ..)
             | Transport::ModbusRtuOverTcp(map, _) => {
                 let map = map.clone();
-                Link::Modbus(ModbusLink::new(profile, map, endpoint, opener)?)
+                Link::Modbus(Box::new(ModbusLink::new(profile, map, endpoint, opener)?))
             }
             Transport::SerialTable(unit, ..) => {
                 let protocol = SerialTable::new(&profile, *unit, opener);
-                Link::Serial(TableLink::new(profile, protocol, endpoint)?)
+                Link::Serial(Box::new(TableLink::new(profile, protocol, endpoint)?))
+            }
+            Transport::Folder(number) => {
+                let protocol = SharedFolder::new(&profile, *number);
+                Link::Folder(Box::new(TableLink::new(profile, protocol, endpoint)?))
             }
         })
     }
@@ -51,6 +58,7 @@ macro_rules! each {
         match $link {
             Link::Modbus($inner) => $call,
             Link::Serial($inner) => $call,
+            Link::Folder($inner) => $call,
         }
     };
 }

@@ -20,6 +20,7 @@
 //! table_link    machines with objects: one exchange after the other
 //! exchange      what is asked, and a protocol's side of it as a pure machine
 //! serial_table  such a protocol, on a serial port; serial_frame: its frames
+//! folder        another, with files in a folder; folder_text: what is in them; folder_port: how they get there
 //! status_image  the status as one row of bytes
 //!
 //! line          a line under it all: no old reply is taken for a new one
@@ -31,6 +32,9 @@ mod contact;
 mod delivery;
 mod driver;
 mod exchange;
+mod folder;
+mod folder_port;
+pub mod folder_text;
 mod limits;
 mod line;
 mod line_port;
@@ -58,6 +62,7 @@ pub use driver::{IntentLog, LogError, deliver};
 pub use exchange::{
     Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
 };
+pub use folder_port::{FolderPort, Letter};
 pub use limits::{Reason, check_limits};
 pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};

@@ -16,10 +16,11 @@ use super::transport::Transport;
 use crate::config::{At, ConfigError, Document};
 use crate::tube::MachineLimits;
 
-const SHIPPED: [(&str, &str); 4] = [
+const SHIPPED: [(&str, &str); 5] = [
     ("reference-modbus", include_str!("../../protocols/reference-modbus.toml")),
     ("reference-rtu", include_str!("../../protocols/reference-rtu.toml")),
     ("reference-serial", include_str!("../../protocols/reference-serial.toml")),
+    ("reference-folder", include_str!("../../protocols/reference-folder.toml")),
     ("reference-rtu-over-tcp", include_str!("../../protocols/reference-rtu-over-tcp.toml")),
 ];
 

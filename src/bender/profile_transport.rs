@@ -24,6 +24,8 @@ pub enum RawTransport {
     RtuOverTcp,
     #[serde(rename = "serial-table")]
     SerialTable,
+    #[serde(rename = "shared-folder")]
+    Folder,
 }
 
 impl RawTransport {
@@ -34,6 +36,7 @@ impl RawTransport {
             RawTransport::Rtu => &["unit_id", "[modbus], [registers]", "[line]", "[serial]"],
             RawTransport::RtuOverTcp => &["unit_id", "[modbus], [registers]", "[line]"],
             RawTransport::SerialTable => &["unit_id", "[line]", "[serial]"],
+            RawTransport::Folder => &["unit_id"],
         };
         needed.contains(&section)
     }
@@ -109,6 +112,9 @@ pub fn parse_transport(
         ) => {
             let unit = integer(doc, unit, "unit_id", 0..=255)? as u8;
             Transport::SerialTable(unit, parse_line(doc, line)?, parse_serial(doc, serial)?)
+        }
+        (RawTransport::Folder, Sections { unit_id: Some(unit), modbus: None, line: None, serial: None }) => {
+            Transport::Folder(integer(doc, unit, "unit_id", 0..=9999)? as u16)
         }
         (kind, _) => {
             let name = doc.text().get(transport.span()).unwrap_or("");

@@ -124,7 +124,10 @@ async fn perform<P: Port>(
         let now_ms = clock();
         match exchange.on(event, now_ms) {
             Action::Done(bytes) => return Ok(bytes),
-            Action::Failed(failure) => return Err(Ended::Failed(failure)),
+            Action::Failed(failure) => {
+                port.discard().await.map_err(Ended::Io)?; // what was asked is asked no more
+                return Err(Ended::Failed(failure));
+            }
             Action::Send { pieces, until_ms } => {
                 for piece in pieces {
                     port.send(piece).await.map_err(Ended::Io)?;

@@ -1,6 +1,7 @@
 //! Which link leads to a machine, and what is known of it: addresses, line, serial port. Read from a profile's file
 //! (`profile_transport`).
 
+use std::path::Path;
 use std::time::Duration;
 
 use schemars::JsonSchema;
@@ -20,6 +21,8 @@ pub enum Transport {
     ModbusRtuOverTcp(ModbusMap, LineSettings),
     /// The serial table protocol on a serial port, with the machine of this number.
     SerialTable(u8, LineSettings, SerialSettings),
+    /// Files in a folder that both reach, for the bender of this number.
+    Folder(u16),
 }
 
 impl Transport {
@@ -28,6 +31,7 @@ impl Transport {
         match self {
             Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => is_host_port(endpoint),
             Transport::ModbusRtu(..) | Transport::SerialTable(..) => is_device(endpoint),
+            Transport::Folder(_) => Path::new(endpoint).is_absolute(),
         }
     }
 
@@ -38,13 +42,14 @@ impl Transport {
             Transport::ModbusRtu(..) | Transport::SerialTable(..) => {
                 "the path of a serial port, best one that does not change: \"/dev/serial/by-id/...\""
             }
+            Transport::Folder(_) => "the path of a folder, from the root: \"/srv/benders\"",
         }
     }
 
     /// What is known of the line, where there is one.
     pub fn line(&self) -> Option<&LineSettings> {
         match self {
-            Transport::ModbusTcp(_) => None,
+            Transport::ModbusTcp(_) | Transport::Folder(_) => None,
             Transport::ModbusRtu(_, line, _)
             | Transport::ModbusRtuOverTcp(_, line)
             | Transport::SerialTable(_, line, _) => Some(line),
@@ -65,7 +70,7 @@ impl Transport {
             Transport::ModbusTcp(map)
             | Transport::ModbusRtu(map, ..)
             | Transport::ModbusRtuOverTcp(map, _) => Some(map),
-            Transport::SerialTable(..) => None,
+            Transport::SerialTable(..) | Transport::Folder(_) => None,
         }
     }
 
@@ -73,7 +78,7 @@ impl Transport {
     pub fn serial(&self) -> Option<&SerialSettings> {
         match self {
             Transport::ModbusRtu(.., serial) | Transport::SerialTable(.., serial) => Some(serial),
-            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => None,
+            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) | Transport::Folder(_) => None,
         }
     }
 }

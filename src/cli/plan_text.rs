@@ -78,6 +78,7 @@ fn transport(profile: &Profile) -> String {
         Transport::ModbusTcp(map) => format!("Modbus TCP, unit {}", map.unit_id),
         Transport::ModbusRtuOverTcp(map, _) => format!("Modbus RTU over TCP, unit {}", map.unit_id),
         Transport::ModbusRtu(map, _, port) => format!("Modbus RTU, {}, unit {}", serial(port), map.unit_id),
+        Transport::Folder(number) => format!("shared folder, bender {number}"),
         Transport::SerialTable(unit, _, port) => {
             format!("serial table protocol, {}, unit {unit}", serial(port))
         }

@@ -49,7 +49,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
 async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
     let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
     let (door, _kept) =
-        Door::open(&profile.transport, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
+        Door::open(&profile, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
     let name = profile.name.clone();
     let model = MachineModel::new(profile, &args.program, args.bends);
     let bender = SimulatedBender::start(door, model, args.fault, |event| say(&describe(&event)))?;

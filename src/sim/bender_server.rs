@@ -10,6 +10,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use super::bender::{MachineEvent, MachineModel};
 use super::door::{Door, Speech};
 use super::faults::{Fault, WireFaults};
+use super::folder_station::FolderStation;
 use super::frames::Framing;
 use super::modbus_station::ModbusStation;
 use super::serial_station::SerialStation;
@@ -87,6 +88,7 @@ impl Drop for SimulatedBender {
 async fn serve_door(door: Door, shared: Arc<Shared>) {
     match door {
         Door::Line(speech, wire, _) => serve_wire(wire, speech, &shared).await,
+        Door::Folder(port, _, profile) => serve(port, FolderStation::new(*profile), &shared).await,
         Door::Memory(speech, mut wires) => {
             while let Some(wire) = wires.recv().await {
                 serve_wire(wire, speech, &shared).await;

@@ -9,7 +9,8 @@ use tokio::sync::mpsc::UnboundedReceiver;
 
 use super::frames::Framing;
 use super::pty::{Kept, machine_end};
-use crate::bender::{Transport, Wire};
+use super::serve::CYCLE;
+use crate::bender::{FolderPort, Profile, Transport, Wire};
 
 /// A door that is open.
 pub enum Door {
@@ -19,6 +20,8 @@ pub enum Door {
     Line(Speech, Box<dyn Wire>, String),
     /// Wires in memory, one after the other.
     Memory(Speech, UnboundedReceiver<DuplexStream>),
+    /// The machine's end of a folder, which people know by this name, and what kind of machine.
+    Folder(FolderPort, String, Box<Profile>),
 }
 
 /// What is spoken on a wire of bytes.
@@ -31,37 +34,49 @@ pub enum Speech {
 }
 
 impl Speech {
-    /// What machines of a transport speak.
-    pub fn of(transport: &Transport) -> Speech {
+    /// What machines of a transport speak on a wire; none where there is none.
+    pub fn of(transport: &Transport) -> Option<Speech> {
         match transport {
-            Transport::ModbusTcp(_) => Speech::Modbus(Framing::Tcp),
-            Transport::ModbusRtu(..) | Transport::ModbusRtuOverTcp(..) => Speech::Modbus(Framing::Rtu),
-            Transport::SerialTable(unit, ..) => Speech::SerialTable(*unit),
+            Transport::ModbusTcp(_) => Some(Speech::Modbus(Framing::Tcp)),
+            Transport::ModbusRtu(..) | Transport::ModbusRtuOverTcp(..) => Some(Speech::Modbus(Framing::Rtu)),
+            Transport::SerialTable(unit, ..) => Some(Speech::SerialTable(*unit)),
+            Transport::Folder(_) => None,
         }
     }
 }
 
 impl Door {
-    /// Opens where machines of a transport are reached, and what must be kept meanwhile: a host and port, or the path of a serial
-    /// port ([`machine_end`]). Must be called inside a tokio runtime.
-    pub async fn open(transport: &Transport, on: &str) -> io::Result<(Door, Option<Kept>)> {
-        Ok(match transport {
+    /// Opens where a machine of this profile is reached, and what must be kept meanwhile: a host and port, the path of a serial
+    /// port ([`machine_end`]), a folder. Must be called inside a tokio runtime.
+    pub async fn open(profile: &Profile, on: &str) -> io::Result<(Door, Option<Kept>)> {
+        Ok(match &profile.transport {
             Transport::ModbusTcp(_) => (Door::Socket(Framing::Tcp, TcpListener::bind(on).await?), None),
             Transport::ModbusRtuOverTcp(..) => {
                 (Door::Socket(Framing::Rtu, TcpListener::bind(on).await?), None)
             }
-            Transport::ModbusRtu(.., settings) | Transport::SerialTable(.., settings) => {
+            Transport::ModbusRtu(.., settings) => {
                 let end = machine_end(Path::new(on), settings)?;
-                (Door::Line(Speech::of(transport), Box::new(end.wire), on.to_owned()), end.kept)
+                (Door::Line(Speech::Modbus(Framing::Rtu), Box::new(end.wire), on.to_owned()), end.kept)
             }
+            Transport::SerialTable(unit, _, settings) => {
+                let end = machine_end(Path::new(on), settings)?;
+                (Door::Line(Speech::SerialTable(*unit), Box::new(end.wire), on.to_owned()), end.kept)
+            }
+            Transport::Folder(number) => (Door::folder(profile, *number, on)?, None),
         })
+    }
+
+    /// The machine's end of a folder.
+    pub fn folder(profile: &Profile, number: u16, on: &str) -> io::Result<Door> {
+        let port = FolderPort::of_machine(Path::new(on), number, CYCLE, profile.deadlines.request)?;
+        Ok(Door::Folder(port, on.to_owned(), Box::new(profile.clone())))
     }
 
     /// What a link is told to reach it.
     pub fn address(&self) -> io::Result<String> {
         Ok(match self {
             Door::Socket(_, listener) => listener.local_addr()?.to_string(),
-            Door::Line(_, _, name) => name.clone(),
+            Door::Line(_, _, name) | Door::Folder(_, name, _) => name.clone(),
             Door::Memory(..) => "in memory".to_owned(),
         })
     }

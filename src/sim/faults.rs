@@ -8,6 +8,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::bender::MachineModel;
+use crate::bender::Letter;
 
 /// A way to misbehave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -191,5 +192,24 @@ impl Damaged for Vec<u8> {
             }
         }
         vec![self]
+    }
+}
+
+impl Damaged for Letter {
+    /// A file comes whole or not at all, but what is in it may be wrong.
+    fn damaged(mut self, fault: ReplyFault, faults: &mut WireFaults) -> Vec<Letter> {
+        if fault == ReplyFault::Twice {
+            return vec![self.clone(), self];
+        }
+        let damages_table = self.table.is_some() && faults.chance(2) == 0;
+        let file = if damages_table { self.table.get_or_insert_default() } else { &mut self.text };
+        let mut arriving = std::mem::take(file).damaged(fault, faults);
+        match arriving.pop() {
+            None => Vec::new(),
+            Some(bytes) => {
+                *file = bytes;
+                vec![self]
+            }
+        }
     }
 }

@@ -4,6 +4,7 @@ pub mod bender;
 pub mod bender_server;
 pub mod door;
 pub mod faults;
+pub mod folder_station;
 pub mod forming;
 pub mod frames;
 pub mod modbus_station;

@@ -6,6 +6,7 @@
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::fmt;
+use std::path::Path;
 use std::time::Duration;
 
 use rand::{RngExt as _, SeedableRng as _};
@@ -14,8 +15,8 @@ use tokio::sync::mpsc;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Profile, TableId, Wire, crc_of, deliver,
-    encode_payload,
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Profile, TableId, Transport, Wire, crc_of,
+    deliver, encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
@@ -96,8 +97,13 @@ pub struct Ends {
     pub link: Link,
 }
 
-/// Wires in memory, as many as are opened.
-pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
+/// Wires in memory, as many as are opened; for machines with a folder, that folder.
+pub fn in_memory(profile: &Profile, folder: &Path) -> Result<Ends, TrialError> {
+    if let Transport::Folder(number) = profile.transport {
+        let on = folder.display().to_string();
+        let door = Door::folder(profile, number, &on)?;
+        return Ok(Ends { door, link: Link::new(profile.clone(), on)? });
+    }
     let (made, wires) = mpsc::unbounded_channel();
     let open = move || {
         let (here, there) = tokio::io::duplex(WIRE_BYTES);
@@ -105,14 +111,19 @@ pub fn in_memory(profile: &Profile) -> Result<Ends, TrialError> {
         Ok(Box::new(here) as Box<dyn Wire>)
     };
     let link = Link::over(profile.clone(), "a wire in memory", Box::new(open))?;
-    Ok(Ends { door: Door::Memory(Speech::of(&profile.transport), wires), link })
+    let speech =
+        Speech::of(&profile.transport).ok_or_else(|| std::io::Error::other("this transport has no wires"))?;
+    Ok(Ends { door: Door::Memory(speech, wires), link })
 }
 
-/// The transport's own: a socket, or a pseudo terminal of this name.
-pub async fn real(profile: &Profile, terminal: &str) -> Result<(Ends, Option<Kept>), TrialError> {
-    let is_serial = profile.transport.takes(terminal);
-    let (door, kept) =
-        Door::open(&profile.transport, if is_serial { terminal } else { "127.0.0.1:0" }).await?;
+/// The transport's own: a socket, a pseudo terminal in this folder, the folder itself.
+pub async fn real(profile: &Profile, folder: &Path) -> Result<(Ends, Option<Kept>), TrialError> {
+    let on = match &profile.transport {
+        Transport::Folder(_) => folder.display().to_string(),
+        transport if transport.serial().is_some() => folder.join("line").display().to_string(),
+        _ => "127.0.0.1:0".to_owned(),
+    };
+    let (door, kept) = Door::open(profile, &on).await?;
     let link = Link::new(profile.clone(), door.address()?)?;
     Ok((Ends { door, link }, kept))
 }

@@ -1,0 +1,243 @@
+//! A shared folder as a port: letters of one text and at most one table, each written under another name, synced, then renamed.
+//!
+//! Both ends use it, each with the other's names. Files are worked on outside of the async threads: a share that hangs must not stop
+//! the rest.
+
+use std::fs::File;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use tokio::task::{JoinHandle, spawn_blocking};
+use tokio::time::{Instant, sleep_until};
+
+use super::exchange::Port;
+
+/// Longest file that is read: a table of the longest program takes a tenth.
+const LONGEST: u64 = 256 * 1024;
+
+/// What goes one way.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Letter {
+    /// Command or answer.
+    pub text: Vec<u8>,
+    /// The table that belongs to it.
+    pub table: Option<Vec<u8>>,
+}
+
+/// File names of one direction.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Names {
+    text: PathBuf,
+    table: PathBuf,
+}
+
+/// One end of a folder.
+#[derive(Debug)]
+pub struct FolderPort {
+    folder: PathBuf,
+    out: Names,
+    back: Names,
+    look: Duration,
+    /// A letter older than this was meant for a time that is over.
+    oldest: Duration,
+    /// The next look, and the one that is under way: a call that is cancelled must not lose what it finds.
+    next: Instant,
+    looking: Option<JoinHandle<io::Result<Option<Letter>>>>,
+}
+
+impl FolderPort {
+    /// benderd's end of what belongs to the bender of this number; the folder is looked at every `look`.
+    pub fn of_daemon(folder: &Path, number: u16, look: Duration, oldest: Duration) -> io::Result<FolderPort> {
+        FolderPort::new(folder, number, [("cmd", "tab"), ("ans", "out")], look, oldest)
+    }
+
+    /// The machine's end.
+    pub fn of_machine(
+        folder: &Path,
+        number: u16,
+        look: Duration,
+        oldest: Duration,
+    ) -> io::Result<FolderPort> {
+        FolderPort::new(folder, number, [("ans", "out"), ("cmd", "tab")], look, oldest)
+    }
+
+    fn new(
+        folder: &Path,
+        number: u16,
+        endings: [(&str, &str); 2],
+        look: Duration,
+        oldest: Duration,
+    ) -> io::Result<FolderPort> {
+        if !folder.is_dir() {
+            let why = format!("{} is no folder, or its share is not mounted", folder.display());
+            return Err(io::Error::new(io::ErrorKind::NotFound, why));
+        }
+        let name = |ending: &str| folder.join(format!("bender{number}.{ending}"));
+        let [out, back] = endings.map(|(text, table)| Names { text: name(text), table: name(table) });
+        let next = Instant::now();
+        Ok(FolderPort { folder: folder.to_owned(), out, back, look, oldest, next, looking: None })
+    }
+}
+
+impl Port for FolderPort {
+    type Piece = Letter;
+
+    /// An old answer, and a command that nobody took.
+    async fn discard(&mut self) -> io::Result<()> {
+        if let Some(looking) = self.looking.take() {
+            looking.await.map_err(io::Error::other)??;
+        }
+        let names = [&self.out.text, &self.back.text, &self.back.table].map(Clone::clone);
+        apart(move || names.iter().try_for_each(|name| remove(name))).await
+    }
+
+    async fn send(&mut self, letter: Letter) -> io::Result<()> {
+        let (folder, names) = (self.folder.clone(), self.out.clone());
+        apart(move || {
+            if let Some(table) = &letter.table {
+                put(&names.table, table)?;
+            }
+            put(&names.text, &letter.text)?;
+            // The names, too; not every share can.
+            let _ = File::open(folder).and_then(|folder| folder.sync_all());
+            Ok(())
+        })
+        .await
+    }
+
+    async fn receive(&mut self) -> io::Result<Letter> {
+        loop {
+            if self.looking.is_none() {
+                sleep_until(self.next).await;
+            }
+            let (names, oldest) = (self.back.clone(), self.oldest);
+            let looking = self.looking.get_or_insert_with(|| spawn_blocking(move || take(&names, oldest)));
+            let found = looking.await;
+            self.looking = None;
+            self.next = Instant::now() + self.look;
+            if let Some(letter) = found.map_err(io::Error::other)?? {
+                return Ok(letter);
+            }
+        }
+    }
+}
+
+async fn apart<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
+    spawn_blocking(work).await.map_err(io::Error::other)?
+}
+
+/// All of it under this name, or nothing.
+fn put(name: &Path, bytes: &[u8]) -> io::Result<()> {
+    let new = name.with_added_extension("new");
+    let mut file = File::create(&new)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    std::fs::rename(new, name)
+}
+
+/// The letter that lies there; it is taken away.
+fn take(names: &Names, oldest: Duration) -> io::Result<Option<Letter>> {
+    let Some((text, written)) = read(&names.text)? else { return Ok(None) };
+    let table = read(&names.table)?.map(|(table, _)| table);
+    remove(&names.text)?;
+    remove(&names.table)?;
+    // A clock that went back makes nothing old.
+    let age = SystemTime::now().duration_since(written).unwrap_or_default();
+    Ok((age <= oldest).then_some(Letter { text, table }))
+}
+
+fn read(name: &Path) -> io::Result<Option<(Vec<u8>, SystemTime)>> {
+    let about = match std::fs::metadata(name) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        about => about?,
+    };
+    if about.len() > LONGEST {
+        let why = format!("{} has {} bytes, allowed are {LONGEST}", name.display(), about.len());
+        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+    }
+    Ok(Some((std::fs::read(name)?, about.modified()?)))
+}
+
+fn remove(name: &Path) -> io::Result<()> {
+    match std::fs::remove_file(name) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LOOK: Duration = Duration::from_millis(5);
+
+    fn ends(folder: &Path, oldest: Duration) -> (FolderPort, FolderPort) {
+        let daemon = FolderPort::of_daemon(folder, 7, LOOK, oldest).unwrap();
+        (daemon, FolderPort::of_machine(folder, 7, LOOK, oldest).unwrap())
+    }
+
+    fn files(folder: &Path) -> Vec<String> {
+        let names = std::fs::read_dir(folder).unwrap().map(|f| f.unwrap().file_name());
+        let mut names: Vec<String> = names.map(|n| n.into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_letter_arrives_whole_and_nothing_is_left_of_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut daemon, mut machine) = ends(folder.path(), Duration::from_secs(60));
+        let letter = Letter { text: b"stage".to_vec(), table: Some(b"rows".to_vec()) };
+        daemon.send(letter.clone()).await.unwrap();
+        assert_eq!(files(folder.path()), ["bender7.cmd", "bender7.tab"]);
+        assert_eq!(machine.receive().await.unwrap(), letter);
+        assert!(files(folder.path()).is_empty());
+        machine.send(Letter { text: b"done".to_vec(), table: None }).await.unwrap();
+        assert_eq!(daemon.receive().await.unwrap().text, b"done");
+        assert!(files(folder.path()).is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_call_that_is_cancelled_loses_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut daemon, mut machine) = ends(folder.path(), Duration::from_secs(60));
+        for turn in 0..50_u8 {
+            daemon.send(Letter { text: vec![turn], table: None }).await.unwrap();
+            let letter = loop {
+                let short = Duration::from_micros(u64::from(turn) * 100);
+                if let Ok(letter) = tokio::time::timeout(short, machine.receive()).await {
+                    break letter.unwrap();
+                }
+            };
+            assert_eq!(letter.text, [turn]);
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_command_that_nobody_took_is_withdrawn_and_an_old_one_is_not_carried_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut daemon, mut machine) = ends(folder.path(), Duration::from_secs(60));
+        daemon.send(Letter { text: b"commit".to_vec(), table: None }).await.unwrap();
+        daemon.discard().await.unwrap();
+        assert!(files(folder.path()).is_empty());
+        // Written by a daemon that died, found two minutes later.
+        daemon.send(Letter { text: b"commit".to_vec(), table: None }).await.unwrap();
+        let file = File::options().write(true).open(folder.path().join("bender7.cmd")).unwrap();
+        file.set_modified(SystemTime::now() - Duration::from_secs(120)).unwrap();
+        let found = tokio::time::timeout(Duration::from_secs(1), machine.receive()).await;
+        assert!(found.is_err(), "{found:?}");
+        assert!(files(folder.path()).is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_is_no_folder_or_no_letter_says_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = FolderPort::of_daemon(&folder.path().join("x"), 7, LOOK, LOOK).unwrap_err().to_string();
+        assert!(error.contains("is no folder, or its share is not mounted"), "{error}");
+        let (mut daemon, _) = ends(folder.path(), Duration::from_secs(60));
+        std::fs::write(folder.path().join("bender7.ans"), vec![b' '; LONGEST as usize + 1]).unwrap();
+        let error = daemon.receive().await.unwrap_err().to_string();
+        assert!(error.contains("has 262145 bytes, allowed are 262144"), "{error}");
+    }
+}
