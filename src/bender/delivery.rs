@@ -5,6 +5,8 @@
 //!   gate         1 table        bit for bit   gate again   on disk         once     the truth
 //! ```
 //!
+//! A correction begins with the table in force instead (`recall`): it must be the one that was committed last.
+//!
 //! One event in (with the time, in milliseconds of the driver's clock), one action out. Three things hold
 //! whatever happens: a commit goes out at most once, never before an equal read-back and a journalled intent;
 //! after the commit only reads decide; and what cannot be decided before the deadline is `Unknown`.
@@ -14,6 +16,7 @@ use serde::Serialize;
 use super::limits::{Reason, check_limits};
 use super::link::ActiveTable;
 use super::profile::{Deadlines, Profile};
+use super::recall::{Operation, objections};
 use super::wire::{Ack, Staged, Status, TableId, crc_of, encode_payload, staging_image};
 use crate::tube::CommandTable;
 
@@ -26,6 +29,8 @@ pub struct Job {
     pub table: CommandTable,
     /// The table that must be in force, where the caller knows: another one was made at the machine.
     pub expected_active: Option<TableId>,
+    /// Whether it makes the rows or corrects what was committed last.
+    pub operation: Operation,
 }
 
 /// A job that broke no limit, as bytes.
@@ -130,6 +135,8 @@ pub enum Action {
 /// What is waited for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
+    /// The table that is to be corrected.
+    Recalling,
     /// The first status.
     Asking,
     /// The staging area being written.
@@ -252,8 +259,9 @@ impl Delivery {
         };
         let action = match prepare(profile, job) {
             Ok(prepared) => {
+                let corrects = matches!(prepared.job.operation, Operation::Correct { .. });
                 delivery.job = Some(prepared);
-                Action::ReadStatus
+                if corrects { delivery.go(State::Recalling, Action::ReadActive) } else { Action::ReadStatus }
             }
             Err(reasons) => delivery.finish(Outcome::Rejected { reasons }),
         };
@@ -264,6 +272,7 @@ impl Delivery {
     pub fn on(&mut self, event: Event, now_ms: u64) -> Action {
         match (self.state, event) {
             (State::Done, _) => self.finished(),
+            (State::Recalling, Event::ActiveRead(active)) => self.recall(active, now_ms),
             (State::Asking, Event::StatusRead(status)) => self.stage(status, now_ms),
             (State::Staging, Event::Written) => {
                 self.go(State::Comparing, Action::ReadStaging { bytes: self.image.len() })
@@ -285,6 +294,20 @@ impl Delivery {
             (State::Pausing, _) => self.go(State::Confirming, Action::ReadActive),
             (_, event) => self.finish(Outcome::NotApplied { why: describe(event) }),
         }
+    }
+
+    /// Before a correction: the machine still holds what was committed, or already what is to be.
+    fn recall(&mut self, active: ActiveTable, now_ms: u64) -> Action {
+        let Some(Prepared { job, crc, .. }) = &self.job else { return self.finished() };
+        if let Operation::Correct { last } = &job.operation
+            && *crc != active.status.active.crc
+        {
+            let reasons = objections(&self.profile, &job.program, last, &job.table, &active);
+            if !reasons.is_empty() {
+                return self.finish(Outcome::Rejected { reasons });
+            }
+        }
+        self.stage(active.status, now_ms)
     }
 
     /// Step 1: who is there; step 2: write the staging area.

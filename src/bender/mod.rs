@@ -7,8 +7,9 @@
 //! profile       what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
 //! transport     which link leads there
 //! limits        the gate's figures: travel, clamp lengths, row count
-//! wire          tables to bytes and back, CRC
+//! rows          tables to the machine's whole steps and back; wire: to bytes and back, CRC
 //! delivery      stage, verify, commit: events and time in, one action out
+//! recall        a correction applies to what was committed last, or not at all
 //! driver        performs the actions on a link and a journal
 //! contact       when a link connects, asks, keeps silent: events and time in, one action out
 //! caller        one machine's connection, under every link
@@ -46,7 +47,9 @@ mod profile;
 mod profile_file;
 mod profile_modbus;
 mod profile_transport;
+mod recall;
 mod registers;
+mod rows;
 mod rs485;
 mod serial_frame;
 mod serial_table;
@@ -67,8 +70,9 @@ pub use limits::{Reason, check_limits};
 pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
 pub use open::{Opener, serial_port};
-pub use profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
+pub use profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
+pub use recall::{Operation, objections};
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{LineSettings, Parity, SerialSettings, Transport};

@@ -9,7 +9,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
+use super::profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
 use super::profile_modbus::{RawModbus, RawRegisters, check_areas};
 use super::profile_transport::{RawLine, RawSerial, RawTransport, Sections, parse_transport};
 use super::transport::Transport;
@@ -63,6 +63,20 @@ struct RawTable {
     length_resolution_mm: At<f64>,
     angle_resolution_deg: At<f64>,
     rotation_sign: At<i64>,
+    #[serde(default)]
+    feed: Sequence,
+    #[serde(default)]
+    rotation: Sequence,
+    columns: Option<RawColumns>,
+}
+
+/// What the machine's screen calls them.
+#[derive(Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+struct RawColumns {
+    length: At<String>,
+    rotation: At<String>,
+    angle: At<String>,
 }
 
 #[derive(Deserialize, JsonSchema)]
@@ -165,6 +179,14 @@ fn parse_table(doc: &Document, raw: &RawTable, word_order: WordOrder) -> Result<
     if sign.abs() != 1 {
         return Err(doc.value_error(raw.rotation_sign.span(), "table.rotation_sign", sign, "1 or -1"));
     }
+    let columns = match &raw.columns {
+        None => ["length", "rotation", "angle"].map(str::to_owned),
+        Some(names) => [
+            text(doc, &names.length, "table.columns.length", 12)?,
+            text(doc, &names.rotation, "table.columns.rotation", 12)?,
+            text(doc, &names.angle, "table.columns.angle", 12)?,
+        ],
+    };
     Ok(TableFormat {
         program_bytes: characters as usize,
         word_order,
@@ -179,6 +201,9 @@ fn parse_table(doc: &Document, raw: &RawTable, word_order: WordOrder) -> Result<
             1e-5..=1.0,
         )?,
         rotation_reversed: sign == -1,
+        feed: raw.feed,
+        rotation: raw.rotation,
+        columns,
     })
 }
 
