@@ -78,6 +78,7 @@ impl World {
             table: table(&mut rng),
             expected_active: None,
             operation: Operation::New,
+            approved: false,
         };
         let meant = BTreeMap::from([(machine.active(), machine.active_payload())]);
         let world = World {

@@ -31,6 +31,8 @@ pub struct Job {
     pub expected_active: Option<TableId>,
     /// Whether it makes the rows or corrects what was committed last.
     pub operation: Operation,
+    /// Whether the operator approved this write: a machine without a staging area takes none without.
+    pub approved: bool,
 }
 
 /// A job that broke no limit, as bytes.
@@ -194,7 +196,13 @@ pub fn prepare(profile: &Profile, job: &Job) -> Result<Prepared, Vec<Reason>> {
 
 /// Why this job may not go to a machine in this status; empty when it may.
 pub fn gate(profile: &Profile, job: &Prepared, status: &Status) -> Vec<Reason> {
-    let mut reasons = identity(job, status);
+    let direct = profile.transport.direct().is_some();
+    let mut reasons = if direct { Vec::new() } else { identity(job, status) };
+    if direct && !job.job.approved {
+        let text = "this machine has no staging area: what is written is in force at once, half of it too; the operator must see \
+                    that nothing is bent and the right program is loaded, and approve the write";
+        reasons.push(Reason::new("approval", None, text));
+    }
     for bit in &profile.state_bits {
         let set = status.state >> bit.bit & 1 == 1;
         if set != bit.must_be {
@@ -313,7 +321,8 @@ impl Delivery {
     /// Step 1: who is there; step 2: write the staging area.
     fn stage(&mut self, status: Status, now_ms: u64) -> Action {
         let Some(job) = &self.job else { return self.finished() };
-        let wrong = identity(job, &status);
+        let direct = self.profile.transport.direct().is_some();
+        let wrong = if direct { Vec::new() } else { identity(job, &status) };
         if wrong.is_empty() && status.active.revision != 0 && status.active.crc == job.crc {
             return self.finish(Outcome::AlreadyActive(status.active));
         }
@@ -322,7 +331,8 @@ impl Delivery {
             return self.finish(Outcome::Rejected { reasons });
         }
         // The gate keeps the sum from overflowing.
-        self.id = TableId { revision: status.active.revision.wrapping_add(1), crc: job.crc };
+        let revision = status.active.revision.wrapping_add(u32::from(!direct)); // such a machine counts none
+        self.id = TableId { revision, crc: job.crc };
         let staged = Staged { id: self.id, payload: job.payload.clone() };
         self.image = staging_image(&self.profile, &staged);
         self.first = Some((status, now_ms));
@@ -359,7 +369,7 @@ impl Delivery {
                 format!("the active table changed from {} to {} meanwhile", first.active, status.active);
             reasons.push(Reason::new("table_changed", None, text));
         }
-        if status.heartbeat == first.heartbeat {
+        if self.profile.transport.direct().is_none() && status.heartbeat == first.heartbeat {
             let waited = now_ms.saturating_sub(*first_ms);
             if reasons.is_empty() && waited < self.profile.deadlines.heartbeat_ms {
                 let until_ms = now_ms + self.profile.deadlines.poll_ms;

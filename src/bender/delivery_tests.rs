@@ -12,6 +12,7 @@ fn job() -> Job {
         table: CommandTable { bends: vec![row], last_length_mm: 50.0 },
         expected_active: None,
         operation: Operation::New,
+        approved: false,
     }
 }
 

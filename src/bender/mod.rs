@@ -15,7 +15,8 @@
 //! caller        one machine's connection, under every link
 //! any_link      the link that a profile asks for
 //!
-//! modbus        machines with registers: TCP, RTU, RTU over TCP
+//! modbus        machines with registers: TCP, RTU, RTU over TCP; modbus_client: one request after the other
+//! direct        machines whose rows are in force as soon as they are written
 //! registers     where their values are; plan: the requests that makes
 //!
 //! table_link    machines with objects: one exchange after the other
@@ -31,6 +32,7 @@ mod any_link;
 mod caller;
 mod contact;
 mod delivery;
+mod direct;
 mod driver;
 mod exchange;
 mod folder;
@@ -41,6 +43,7 @@ mod line;
 mod line_port;
 mod link;
 mod modbus;
+mod modbus_client;
 mod open;
 pub mod plan;
 mod profile;
@@ -61,6 +64,7 @@ mod wire;
 pub use any_link::Link;
 pub use contact::RulesError;
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
+pub use direct::DirectMap;
 pub use driver::{IntentLog, LogError, deliver};
 pub use exchange::{
     Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
@@ -75,7 +79,7 @@ pub use profile_file::shipped_profiles;
 pub use recall::{Operation, objections};
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
 pub use status_image::{decode_status_image, status_bytes};
-pub use transport::{LineSettings, Parity, SerialSettings, Transport};
+pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{
     Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, encode_payload,
     payload_bytes, staging_image,

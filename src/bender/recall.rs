@@ -37,9 +37,9 @@ pub fn objections(
         Ok(held) => held,
         Err(why) => return reason(format!("the machine's table cannot be read: {why}")),
     };
-    let mut reasons = Vec::new();
+    let (mut reasons, direct) = (Vec::new(), profile.transport.direct().is_some());
     if encode_payload(profile, program, last).is_ok_and(|committed| committed != active.payload) {
-        if held_program != program.trim_end_matches(' ') {
+        if !direct && held_program != program.trim_end_matches(' ') {
             let text = format!(
                 "the machine's table is for program {held_program:?}, committed was one for {program:?}"
             );
@@ -85,7 +85,9 @@ fn differences(profile: &Profile, last: &CommandTable, held: &CommandTable) -> V
         }
     }
     let tail = |t: &CommandTable| (t.last_length_mm / table.length_resolution_mm).round();
-    compare(None, "last length", units[0], tail(last), tail(held));
+    if profile.transport.direct().is_none() {
+        compare(None, "last length", units[0], tail(last), tail(held));
+    }
     reasons
 }
 

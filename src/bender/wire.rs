@@ -121,22 +121,32 @@ pub fn encode_payload(
         reasons.push(reason);
         Vec::new()
     });
-    let count = u16::try_from(table.bends.len()).unwrap_or(u16::MAX); // more rows than that break a limit anyway
+    let direct = profile.transport.direct().is_some();
+    let (rows, most, last_length_mm) = if direct {
+        out.fill(0); // such a machine knows neither the program nor what is behind the last bend
+        (profile.limits.max_bends, f64::from(i16::MAX), 0.0)
+    } else {
+        (table.bends.len(), f64::from(i32::MAX), table.last_length_mm)
+    };
+    let count = u16::try_from(rows).unwrap_or(u16::MAX); // more rows than that break a limit anyway
     out.extend(count.to_be_bytes());
     out.extend([0, 0]);
     let mut put = |bend: Option<usize>, column: &str, number: f64| {
-        if number.abs() <= f64::from(i32::MAX) {
+        if number.abs() <= most {
             out.extend(profile.table.word_order.arrange((number as i32).to_be_bytes()));
         } else {
             let text = format!("{column}: {number} steps do not fit the machine's numbers");
             reasons.push(Reason::new("not_encodable", bend, text));
         }
     };
-    put(None, "last length", (table.last_length_mm / profile.table.length_resolution_mm).round());
+    put(None, "last length", (last_length_mm / profile.table.length_resolution_mm).round());
     for (i, row) in steps_of(&profile.table, table).iter().enumerate() {
         for (column, number) in profile.table.columns.iter().zip(row.numbers) {
             put(Some(i + 1), column, number);
         }
+    }
+    for _ in table.bends.len()..rows {
+        out.extend([0; Profile::ROW_BYTES]);
     }
     if reasons.is_empty() { Ok(out) } else { Err(reasons) }
 }
@@ -158,7 +168,12 @@ pub fn decode_payload(profile: &Profile, payload: &[u8]) -> Result<(String, Comm
         let at = header + i * Profile::ROW_BYTES;
         [value(at), value(at + 4), value(at + 8)]
     };
-    let numbers: Vec<[i32; 3]> = (0..count).map(numbers).collect();
+    let mut numbers: Vec<[i32; 3]> = (0..count).map(numbers).collect();
+    if profile.transport.direct().is_some() {
+        // What is behind the last bend is 0.
+        let bends = numbers.iter().rposition(|row| row[2] != 0).map_or(0, |last| last + 1);
+        numbers.truncate(bends);
+    }
     let table = CommandTable {
         bends: rows_of(&profile.table, &numbers),
         last_length_mm: f64::from(value(header - 4)) * profile.table.length_resolution_mm,

@@ -183,7 +183,7 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
             Action::ReadMachine(ticket) => self.ask(Ask::Read(ticket)),
             Action::Deliver(ticket, table, expected, operation) => {
                 let program = self.identity.program.clone();
-                let job = Job { program, table, expected_active: Some(expected), operation };
+                let job = Job { program, table, expected_active: Some(expected), operation, approved: false };
                 self.ask(Ask::Deliver(ticket, job));
             }
             Action::Measure(ticket, scan) => self.hand_out(move |craft| measured(craft, ticket, &scan)),

@@ -144,6 +144,7 @@ mod tests {
             table: CommandTable::default(),
             expected_active: None,
             operation: Operation::New,
+            approved: false,
         }
     }
 

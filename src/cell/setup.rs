@@ -143,6 +143,7 @@ impl Setup {
                 table: first.commanded,
                 expected_active: None,
                 operation: Operation::New,
+                approved: true, // of a machine that is not asked
             };
             match prepare(&self.profile, &job) {
                 Ok(_) => return Ok(()),

@@ -35,6 +35,10 @@ pub struct Args {
     /// or removed. Without it the rows are made anew, whatever the machine holds.
     #[arg(long)]
     correct: bool,
+    /// The operator has seen that nothing is bent and the right program is loaded: needed for machines without a staging area, whose
+    /// rows are in force as soon as they are written.
+    #[arg(long)]
+    approve: bool,
     /// Connects and reads, says what would be done, writes nothing.
     #[arg(long)]
     dry_run: bool,
@@ -132,7 +136,7 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     if !args.json {
         report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
-    let job = Job { program, table, expected_active: None, operation };
+    let job = Job { program, table, expected_active: None, operation, approved: args.approve };
     let mut link = Link::new(profile, endpoint)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
@@ -172,7 +176,9 @@ async fn push(
         report.active = Some(active_id);
         if let Ok(prepared) = prepare(link.profile(), &job) {
             let same = active_id.revision != 0 && active_id.crc == prepared.crc;
-            let revision = active_id.revision.wrapping_add(u32::from(!same));
+            let revision = active_id
+                .revision
+                .wrapping_add(u32::from(!same && link.profile().transport.direct().is_none()));
             report.new = Some(TableId { revision, crc: prepared.crc });
         }
         if !args.json {

@@ -141,8 +141,13 @@ pub async fn run(
     let last = table(&mut rng, bends);
     let old = encode(&last);
     let operation = if seed % 2 == 0 { Operation::Correct { last } } else { Operation::New };
-    let job =
-        Job { program: PROGRAM.into(), table: table(&mut rng, bends), expected_active: None, operation };
+    let job = Job {
+        program: PROGRAM.into(),
+        table: table(&mut rng, bends),
+        expected_active: None,
+        operation,
+        approved: false,
+    };
     let new = encode(&job.table);
     let edited = encode(&table(&mut rng, bends));
 
