@@ -1,5 +1,7 @@
 //! The link that a profile asks for.
 
+use super::can::BusOpener;
+use super::can_table::CanTable;
 use super::contact::RulesError;
 use super::direct::DirectLink;
 use super::folder::SharedFolder;
@@ -7,6 +9,7 @@ use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus::ModbusLink;
 use super::open::Opener;
 use super::profile::Profile;
+use super::sdo::Canopen;
 use super::serial_table::SerialTable;
 use super::table_link::TableLink;
 use super::transport::{Device, Transport};
@@ -22,20 +25,38 @@ pub enum Link {
     Serial(Box<TableLink<SerialTable>>),
     /// A folder that both reach.
     Folder(Box<TableLink<SharedFolder>>),
+    /// Messages on CAN.
+    Can(Box<TableLink<CanTable>>),
+    /// Objects on CANopen.
+    Canopen(Box<TableLink<Canopen>>),
 }
 
 impl Link {
     /// A link that connects at its first use; `endpoint` is what the profile's transport takes.
     pub fn new(profile: Profile, endpoint: impl Into<String>) -> Result<Link, RulesError> {
-        Link::made(profile, endpoint.into(), None)
+        Link::made(profile, endpoint.into(), None, None)
     }
 
     /// The same over wires that `opener` makes; the endpoint is their name.
     pub fn over(profile: Profile, endpoint: impl Into<String>, opener: Opener) -> Result<Link, RulesError> {
-        Link::made(profile, endpoint.into(), Some(opener))
+        Link::made(profile, endpoint.into(), Some(opener), None)
     }
 
-    fn made(profile: Profile, endpoint: String, opener: Option<Opener>) -> Result<Link, RulesError> {
+    /// The same on a bus where `opener` takes a place.
+    pub fn on_bus(
+        profile: Profile,
+        endpoint: impl Into<String>,
+        opener: BusOpener,
+    ) -> Result<Link, RulesError> {
+        Link::made(profile, endpoint.into(), None, Some(opener))
+    }
+
+    fn made(
+        profile: Profile,
+        endpoint: String,
+        opener: Option<Opener>,
+        bus: Option<BusOpener>,
+    ) -> Result<Link, RulesError> {
         Ok(match &profile.transport {
             Transport::ModbusTcp(device)
             | Transport::ModbusRtu(device, ..)
@@ -55,6 +76,14 @@ impl Link {
                 let protocol = SharedFolder::new(&profile, *number);
                 Link::Folder(Box::new(TableLink::new(profile, protocol, endpoint)?))
             }
+            Transport::Can(settings) => {
+                let protocol = CanTable::new(&profile, settings, bus);
+                Link::Can(Box::new(TableLink::new(profile, protocol, endpoint)?))
+            }
+            Transport::Canopen(settings) => {
+                let protocol = Canopen::new(&profile, settings, bus);
+                Link::Canopen(Box::new(TableLink::new(profile, protocol, endpoint)?))
+            }
         })
     }
 }
@@ -67,6 +96,8 @@ macro_rules! each {
             Link::Direct($inner) => $call,
             Link::Serial($inner) => $call,
             Link::Folder($inner) => $call,
+            Link::Can($inner) => $call,
+            Link::Canopen($inner) => $call,
         }
     };
 }

@@ -23,6 +23,7 @@
 //! exchange      what is asked, and a protocol's side of it as a pure machine
 //! serial_table  such a protocol, on a serial port; serial_frame: its frames
 //! folder        another, with files in a folder; folder_text: what is in them; folder_port: how they get there
+//! can_table     another, with messages on CAN; sdo: CANopen's; can: frames and buses; dbc: which bits are which value
 //! status_image  the status as one row of bytes
 //!
 //! line          a line under it all: no old reply is taken for a new one
@@ -30,7 +31,10 @@
 
 mod any_link;
 mod caller;
+pub mod can;
+mod can_table;
 mod contact;
+mod dbc;
 mod delivery;
 mod direct;
 mod driver;
@@ -47,6 +51,7 @@ mod modbus_client;
 mod open;
 pub mod plan;
 mod profile;
+mod profile_can;
 mod profile_file;
 mod profile_modbus;
 mod profile_transport;
@@ -54,6 +59,7 @@ mod recall;
 mod registers;
 mod rows;
 mod rs485;
+mod sdo;
 mod serial_frame;
 mod serial_table;
 mod status_image;
@@ -62,7 +68,9 @@ mod transport;
 mod wire;
 
 pub use any_link::Link;
+pub use can_table::{CanSettings, CanTable};
 pub use contact::RulesError;
+pub use dbc::{Database, DbcError};
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
 pub use direct::DirectMap;
 pub use driver::{IntentLog, LogError, deliver};
@@ -78,6 +86,7 @@ pub use profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder
 pub use profile_file::shipped_profiles;
 pub use recall::{Operation, objections};
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
+pub use sdo::{Canopen, CanopenSettings, Object as SdoObject};
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{

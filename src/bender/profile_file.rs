@@ -10,19 +10,22 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
+use super::profile_can::{RawCan, RawCanopen, check_can};
 use super::profile_modbus::{RawDirect, RawModbus, RawRegisters, check_areas};
 use super::profile_transport::{RawLine, RawMap, RawSerial, RawTransport, Sections, parse_transport};
 use super::transport::Transport;
 use crate::config::{At, ConfigError, Document};
 use crate::tube::MachineLimits;
 
-const SHIPPED: [(&str, &str); 6] = [
+const SHIPPED: [(&str, &str); 8] = [
     ("reference-modbus", include_str!("../../protocols/reference-modbus.toml")),
     ("reference-rtu", include_str!("../../protocols/reference-rtu.toml")),
     ("reference-serial", include_str!("../../protocols/reference-serial.toml")),
     ("reference-folder", include_str!("../../protocols/reference-folder.toml")),
     ("ten-row", include_str!("../../protocols/ten-row.toml")),
     ("reference-rtu-over-tcp", include_str!("../../protocols/reference-rtu-over-tcp.toml")),
+    ("reference-can", include_str!("../../protocols/reference-can.toml")),
+    ("reference-canopen", include_str!("../../protocols/reference-canopen.toml")),
 ];
 
 /// Longest name of a program on machines that keep none.
@@ -47,6 +50,8 @@ struct RawProfile {
     direct: Option<RawDirect>,
     line: Option<RawLine>,
     serial: Option<RawSerial>,
+    can: Option<RawCan>,
+    canopen: Option<RawCanopen>,
     constants: RawConstants,
     table: RawTable,
     state_bit: Vec<RawStateBit>,
@@ -150,9 +155,16 @@ impl Profile {
             },
             line: raw.line.as_ref(),
             serial: raw.serial.as_ref(),
+            can: raw.can.as_ref(),
+            canopen: raw.canopen.as_ref(),
         };
         let table = parse_table(doc, &raw.table, sections.word_order(), raw.direct.is_some())?;
-        let transport = parse_transport(doc, &raw.transport, &sections)?;
+        if raw.can.is_some()
+            && let Some(characters) = &raw.table.program_characters
+        {
+            check_can(doc, characters, &raw.limits.max_bends)?;
+        }
+        let transport = parse_transport(doc, &raw.transport, &sections, &table)?;
         let layout = match (&raw.constants.layout, transport.direct()) {
             (Some(layout), None) => integer(doc, layout, "constants.layout", 0..=0xffff)? as u16,
             (None, Some(_)) => 0,

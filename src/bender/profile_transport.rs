@@ -7,7 +7,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::profile::WordOrder;
+use super::profile::{TableFormat, WordOrder};
+use super::profile_can::{RawCan, RawCanopen, parse_can, parse_canopen};
 use super::profile_file::integer;
 use super::profile_modbus::{RawDirect, RawModbus, RawRegisters, parse_direct, parse_modbus};
 use super::transport::{Device, LineSettings, Parity, SerialSettings, Transport};
@@ -26,6 +27,10 @@ pub enum RawTransport {
     SerialTable,
     #[serde(rename = "shared-folder")]
     Folder,
+    #[serde(rename = "can")]
+    Can,
+    #[serde(rename = "canopen")]
+    Canopen,
 }
 
 impl RawTransport {
@@ -37,6 +42,8 @@ impl RawTransport {
             RawTransport::RtuOverTcp => &["unit_id", "[modbus]", "[registers] or [direct]", "[line]"],
             RawTransport::SerialTable => &["unit_id", "[line]", "[serial]"],
             RawTransport::Folder => &["unit_id"],
+            RawTransport::Can => &["[can]"],
+            RawTransport::Canopen => &["[canopen]"],
         };
         needed.contains(&section)
     }
@@ -70,6 +77,10 @@ pub struct Sections<'a> {
     pub line: Option<&'a RawLine>,
     /// `[serial]`.
     pub serial: Option<&'a RawSerial>,
+    /// `[can]`.
+    pub can: Option<&'a RawCan>,
+    /// `[canopen]`.
+    pub canopen: Option<&'a RawCanopen>,
 }
 
 /// Where a Modbus device keeps its values.
@@ -87,13 +98,15 @@ impl Sections<'_> {
         self.modbus.map_or(WordOrder::Abcd, |modbus| modbus.word_order.into())
     }
 
-    fn all(&self) -> [(&'static str, bool); 5] {
+    fn all(&self) -> [(&'static str, bool); 7] {
         [
             ("unit_id", self.unit_id.is_some()),
             ("[modbus]", self.modbus.is_some()),
             ("[registers] or [direct]", self.map.is_some()),
             ("[line]", self.line.is_some()),
             ("[serial]", self.serial.is_some()),
+            ("[can]", self.can.is_some()),
+            ("[canopen]", self.canopen.is_some()),
         ]
     }
 }
@@ -103,70 +116,52 @@ pub fn parse_transport(
     doc: &Document,
     transport: &At<RawTransport>,
     sections: &Sections<'_>,
+    table: &TableFormat,
 ) -> Result<Transport, ConfigError> {
-    let device = |unit_id, modbus, map: &RawMap<'_>| {
-        Ok(match map {
-            RawMap::Staged(registers) => Device::Staged(parse_modbus(doc, unit_id, modbus, registers)?),
+    let kind = *transport.get_ref();
+    let complaint = || complaint(doc, transport, sections);
+    if sections.all().into_iter().any(|(name, is)| kind.needs(name) != is) {
+        return Err(complaint());
+    }
+    let unit = || sections.unit_id.ok_or_else(complaint);
+    let device = || {
+        let modbus = sections.modbus.ok_or_else(complaint)?;
+        Ok(match sections.map.ok_or_else(complaint)? {
+            RawMap::Staged(registers) => Device::Staged(parse_modbus(doc, unit()?, modbus, registers)?),
             RawMap::Direct(direct, rows, coils) => {
-                Device::Direct(parse_direct(doc, unit_id, modbus, direct, *rows, *coils)?)
+                Device::Direct(parse_direct(doc, unit()?, modbus, direct, rows, coils)?)
             }
         })
     };
-    Ok(match (transport.get_ref(), sections) {
-        (
-            RawTransport::Tcp,
-            Sections { unit_id: Some(unit), modbus: Some(modbus), map: Some(map), line: None, serial: None },
-        ) => Transport::ModbusTcp(device(unit, modbus, map)?),
-        (
-            RawTransport::Rtu,
-            Sections {
-                unit_id: Some(unit),
-                modbus: Some(modbus),
-                map: Some(map),
-                line: Some(line),
-                serial: Some(serial),
-            },
-        ) => Transport::ModbusRtu(
-            device(unit, modbus, map)?,
-            parse_line(doc, line)?,
-            parse_serial(doc, serial)?,
-        ),
-        (
-            RawTransport::RtuOverTcp,
-            Sections {
-                unit_id: Some(unit),
-                modbus: Some(modbus),
-                map: Some(map),
-                line: Some(line),
-                serial: None,
-            },
-        ) => Transport::ModbusRtuOverTcp(device(unit, modbus, map)?, parse_line(doc, line)?),
-        (
-            RawTransport::SerialTable,
-            Sections { unit_id: Some(unit), modbus: None, map: None, line: Some(line), serial: Some(serial) },
-        ) => {
-            let unit = integer(doc, unit, "unit_id", 0..=255)? as u8;
-            Transport::SerialTable(unit, parse_line(doc, line)?, parse_serial(doc, serial)?)
+    let line = || parse_line(doc, sections.line.ok_or_else(complaint)?);
+    let serial = || parse_serial(doc, sections.serial.ok_or_else(complaint)?);
+    Ok(match kind {
+        RawTransport::Tcp => Transport::ModbusTcp(device()?),
+        RawTransport::Rtu => Transport::ModbusRtu(device()?, line()?, serial()?),
+        RawTransport::RtuOverTcp => Transport::ModbusRtuOverTcp(device()?, line()?),
+        RawTransport::SerialTable => {
+            Transport::SerialTable(integer(doc, unit()?, "unit_id", 0..=255)? as u8, line()?, serial()?)
         }
-        (
-            RawTransport::Folder,
-            Sections { unit_id: Some(unit), modbus: None, map: None, line: None, serial: None },
-        ) => Transport::Folder(integer(doc, unit, "unit_id", 0..=9999)? as u16),
-        (kind, _) => {
-            let name = doc.text().get(transport.span()).unwrap_or("");
-            let (with, without): (Vec<_>, Vec<_>) = {
-                let wrong = sections.all().into_iter().filter(|(name, is)| kind.needs(name) != *is);
-                wrong.partition(|(_, is)| !*is)
-            };
-            let list = |what: &str, names: &[(&str, bool)]| {
-                let names: Vec<&str> = names.iter().map(|(name, _)| *name).collect();
-                if names.is_empty() { String::new() } else { format!("{what} {}", names.join(" and ")) }
-            };
-            let allowed = [list("with", &with), list("without", &without)];
-            let allowed: Vec<String> = allowed.into_iter().filter(|text| !text.is_empty()).collect();
-            return Err(doc.value_error(transport.span(), "transport", name, allowed.join(", ")));
+        RawTransport::Folder => Transport::Folder(integer(doc, unit()?, "unit_id", 0..=9999)? as u16),
+        RawTransport::Can => Transport::Can(parse_can(doc, sections.can.ok_or_else(complaint)?, table)?),
+        RawTransport::Canopen => {
+            Transport::Canopen(parse_canopen(doc, sections.canopen.ok_or_else(complaint)?)?)
         }
     })
+}
+
+/// What is missing, and what there is no use for.
+fn complaint(doc: &Document, transport: &At<RawTransport>, sections: &Sections<'_>) -> ConfigError {
+    let name = doc.text().get(transport.span()).unwrap_or("");
+    let wrong = sections.all().into_iter().filter(|(name, is)| transport.get_ref().needs(name) != *is);
+    let (with, without): (Vec<_>, Vec<_>) = wrong.partition(|(_, is)| !*is);
+    let list = |what: &str, names: &[(&str, bool)]| {
+        let names: Vec<&str> = names.iter().map(|(name, _)| *name).collect();
+        if names.is_empty() { String::new() } else { format!("{what} {}", names.join(" and ")) }
+    };
+    let allowed = [list("with", &with), list("without", &without)];
+    let allowed: Vec<String> = allowed.into_iter().filter(|text| !text.is_empty()).collect();
+    doc.value_error(transport.span(), "transport", name, allowed.join(", "))
 }
 
 fn parse_line(doc: &Document, raw: &RawLine) -> Result<LineSettings, ConfigError> {

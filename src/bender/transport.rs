@@ -7,12 +7,14 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::can_table::CanSettings;
 use super::direct::DirectMap;
 use super::registers::ModbusMap;
+use super::sdo::CanopenSettings;
 use crate::config::{HOST_PORT, is_device, is_host_port};
 
 /// Which link leads to the machine.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Transport {
     /// Modbus TCP. A stream: dropped on any doubt.
     ModbusTcp(Device),
@@ -24,6 +26,18 @@ pub enum Transport {
     SerialTable(u8, LineSettings, SerialSettings),
     /// Files in a folder that both reach, for the bender of this number.
     Folder(u16),
+    /// Messages on CAN that a database describes.
+    Can(CanSettings),
+    /// Objects of a dictionary on CANopen.
+    Canopen(CanopenSettings),
+}
+
+/// Longest name of a network interface.
+const INTERFACE_CHARACTERS: usize = 15;
+
+fn is_interface(endpoint: &str) -> bool {
+    let fits = (1..=INTERFACE_CHARACTERS).contains(&endpoint.len());
+    fits && endpoint.bytes().all(|b| b.is_ascii_graphic() && b != b'/' && b != b':')
 }
 
 impl Transport {
@@ -33,6 +47,7 @@ impl Transport {
             Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => is_host_port(endpoint),
             Transport::ModbusRtu(..) | Transport::SerialTable(..) => is_device(endpoint),
             Transport::Folder(_) => Path::new(endpoint).is_absolute(),
+            Transport::Can(_) | Transport::Canopen(_) => is_interface(endpoint),
         }
     }
 
@@ -44,13 +59,18 @@ impl Transport {
                 "the path of a serial port, best one that does not change: \"/dev/serial/by-id/...\""
             }
             Transport::Folder(_) => "the path of a folder, from the root: \"/srv/benders\"",
+            Transport::Can(_) | Transport::Canopen(_) => {
+                "the name of a CAN interface: \"can0\", 1 to 15 characters"
+            }
         }
     }
 
     /// What is known of the line, where there is one.
     pub fn line(&self) -> Option<&LineSettings> {
         match self {
-            Transport::ModbusTcp(_) | Transport::Folder(_) => None,
+            Transport::ModbusTcp(_) | Transport::Folder(_) | Transport::Can(_) | Transport::Canopen(_) => {
+                None
+            }
             Transport::ModbusRtu(_, line, _)
             | Transport::ModbusRtuOverTcp(_, line)
             | Transport::SerialTable(_, line, _) => Some(line),
@@ -71,7 +91,9 @@ impl Transport {
             Transport::ModbusTcp(device)
             | Transport::ModbusRtu(device, ..)
             | Transport::ModbusRtuOverTcp(device, _) => Some(device),
-            Transport::SerialTable(..) | Transport::Folder(_) => None,
+            Transport::SerialTable(..) | Transport::Folder(_) | Transport::Can(_) | Transport::Canopen(_) => {
+                None
+            }
         }
     }
 
@@ -95,7 +117,7 @@ impl Transport {
     pub fn serial(&self) -> Option<&SerialSettings> {
         match self {
             Transport::ModbusRtu(.., serial) | Transport::SerialTable(.., serial) => Some(serial),
-            Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) | Transport::Folder(_) => None,
+            _ => None,
         }
     }
 }

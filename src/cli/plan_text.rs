@@ -98,6 +98,9 @@ fn transport(profile: &Profile) -> String {
         Transport::ModbusRtu(device, _, port) => {
             format!("Modbus RTU, {}, unit {}", serial(port), unit(device))
         }
+        Transport::Can(can) if can.fd => "CAN FD".into(),
+        Transport::Can(_) => "CAN".into(),
+        Transport::Canopen(canopen) => format!("CANopen, node {}", canopen.node),
         Transport::Folder(number) => format!("shared folder, bender {number}"),
         Transport::SerialTable(unit, _, port) => {
             format!("serial table protocol, {}, unit {unit}", serial(port))

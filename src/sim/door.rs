@@ -54,6 +54,10 @@ impl Door {
             Transport::ModbusRtuOverTcp(..) => {
                 (Door::Socket(Framing::Rtu, TcpListener::bind(on).await?), None)
             }
+            // wip: the server of stations puts them there
+            Transport::Can(_) | Transport::Canopen(_) => {
+                return Err(io::Error::new(io::ErrorKind::Unsupported, "no simulated bender on CAN yet"));
+            }
             Transport::ModbusRtu(.., settings) => {
                 let end = machine_end(Path::new(on), settings)?;
                 (Door::Line(Speech::Modbus(Framing::Rtu), Box::new(end.wire), on.to_owned()), end.kept)

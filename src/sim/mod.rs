@@ -2,6 +2,7 @@
 
 pub mod bender;
 pub mod bender_server;
+pub mod can_station;
 pub mod direct_registers;
 pub mod door;
 pub mod faults;
@@ -14,6 +15,7 @@ pub mod pty;
 pub mod registers;
 pub mod scan;
 pub mod scan_file;
+pub mod sdo_server;
 pub mod serial_station;
 pub mod serve;
 pub mod station;

@@ -1,0 +1,268 @@
+//! Deliveries over CAN and CANopen: on a bus in memory in simulated time, and where `BENDERD_CAN` names an interface of this computer (a
+//! vcan, say) the same once more over the socket; a bus-off and an adapter that is pulled out on the way.
+
+#![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use benderd::bender::can::{Bus, CanPort, MemoryBus, Socket, open_port};
+use benderd::bender::{
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Port as _, Profile, TableId, Transport,
+    deliver,
+};
+use benderd::config::Document;
+use benderd::sim::bender::MachineModel;
+use benderd::sim::can_station::CanStation;
+use benderd::sim::faults::Fault;
+use benderd::sim::sdo_server::SdoServer;
+use benderd::sim::station::{Controller, Station};
+use benderd::tube::{CommandRow, CommandTable};
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+/// Profiles of every way over a bus.
+const WAYS: [(&str, &str, &str); 4] = [
+    ("reference-can", "", ""),
+    ("reference-can", "fd = false", "fd = true"),
+    ("reference-canopen", "", ""),
+    ("reference-canopen", "\"block\"", "\"segmented\""),
+];
+
+fn profile((name, from, to): (&str, &str, &str)) -> Profile {
+    let text =
+        std::fs::read_to_string(format!("{}/protocols/{name}.toml", env!("CARGO_MANIFEST_DIR"))).unwrap();
+    Profile::parse(&Document::new("p.toml", text.replacen(from, to, 1))).unwrap()
+}
+
+/// Where daemon and machine meet.
+#[derive(Clone)]
+enum Meeting {
+    Memory(MemoryBus),
+    Interface(String),
+}
+
+impl Meeting {
+    fn name(&self) -> &str {
+        match self {
+            Meeting::Memory(_) => "can0",
+            Meeting::Interface(name) => name,
+        }
+    }
+
+    fn link(&self, profile: &Profile) -> Link {
+        match self.clone() {
+            Meeting::Interface(name) => Link::new(profile.clone(), name).unwrap(),
+            Meeting::Memory(bus) => {
+                let open = move |name: &str| Ok(Box::new(bus.join(name)?) as Box<dyn Bus>);
+                Link::on_bus(profile.clone(), self.name(), Box::new(open)).unwrap()
+            }
+        }
+    }
+
+    fn machine_port(&self, fd: bool) -> CanPort {
+        let patience = Duration::from_secs(1);
+        match self {
+            Meeting::Memory(bus) => CanPort::new(Box::new(bus.join("machine").unwrap()), "machine", patience),
+            Meeting::Interface(name) => open_port(name, None, fd, patience).unwrap(),
+        }
+    }
+}
+
+/// A machine on the bus, until it is dropped.
+struct Machine {
+    model: Arc<Mutex<MachineModel>>,
+    task: JoinHandle<()>,
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl Machine {
+    fn start(meeting: &Meeting, profile: &Profile, fault: Option<Fault>) -> Machine {
+        let model = Arc::new(Mutex::new(MachineModel::new(profile.clone(), "P1", 3)));
+        let task = match profile.transport.clone() {
+            Transport::Can(can) => tokio::spawn(serve(
+                meeting.machine_port(can.fd),
+                CanStation::new(),
+                Arc::clone(&model),
+                fault,
+            )),
+            Transport::Canopen(canopen) => tokio::spawn(serve(
+                meeting.machine_port(false),
+                SdoServer::new(canopen),
+                Arc::clone(&model),
+                fault,
+            )),
+            other => panic!("{other:?}"),
+        };
+        Machine { model, task }
+    }
+
+    fn active(&self) -> TableId {
+        self.model.lock().unwrap().active()
+    }
+}
+
+/// Takes frames off the bus, and runs a program cycle every 10 ms.
+async fn serve(
+    mut port: CanPort,
+    mut station: impl Station<Piece = benderd::bender::can::Frame>,
+    model: Arc<Mutex<MachineModel>>,
+    fault: Option<Fault>,
+) {
+    let (mut interval, mut mute) = (tokio::time::interval(Duration::from_millis(10)), false);
+    loop {
+        let heard = tokio::select! {
+            heard = port.receive() => Some(heard.unwrap()),
+            _ = interval.tick() => None,
+        };
+        let answers = {
+            let mut model = model.lock().unwrap();
+            let ticks = heard.is_none();
+            let mut controller = Controller { model: &mut model, fault, mute: &mut mute };
+            let answers = match heard {
+                Some(frame) => station.hear(frame, &mut controller),
+                None => station.cycle(&mut controller),
+            };
+            if ticks {
+                model.tick();
+            }
+            answers
+        };
+        for answer in answers {
+            port.send(answer).await.unwrap();
+        }
+    }
+}
+
+#[derive(Default)]
+struct Memory(Vec<Intent>);
+
+impl IntentLog for Memory {
+    fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
+        self.0.push(intent.clone());
+        Ok(())
+    }
+
+    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
+        Ok(())
+    }
+}
+
+fn job(length_mm: f64) -> Job {
+    let row = CommandRow { length_mm, rotation_rad: -0.5, angle_rad: 1.25 };
+    let table = CommandTable { bends: vec![row; 3], last_length_mm: 50.0 };
+    Job { program: "P1".into(), table, expected_active: None }
+}
+
+/// One delivery after the other; the second is the table in force when the machine says so.
+async fn deliveries(meeting: Meeting, way: (&str, &str, &str)) {
+    let profile = profile(way);
+    let machine = Machine::start(&meeting, &profile, None);
+    let mut link = meeting.link(&profile);
+    for (revision, length_mm) in [(1, 100.0), (2, 120.5)] {
+        let mut log = Memory::default();
+        let begun = Instant::now();
+        let outcome = deliver(&mut link, &job(length_mm), &mut log).await;
+        assert!(matches!(outcome, Outcome::Applied(_)), "{way:?}: {outcome:?}");
+        assert_eq!((machine.active().revision, log.0.len()), (revision, 1));
+        let active = link.read_active().await.unwrap();
+        assert_eq!(active.payload, machine.model.lock().unwrap().active_payload());
+        println!("{} {}: a table of 3 bends in {} ms", way.0, way.2, begun.elapsed().as_millis());
+    }
+    let outcome = deliver(&mut link, &job(120.5), &mut Memory::default()).await;
+    assert!(matches!(outcome, Outcome::AlreadyActive(_)), "{outcome:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn tables_arrive_over_a_bus_in_memory() {
+    for way in WAYS {
+        deliveries(Meeting::Memory(MemoryBus::new()), way).await;
+    }
+}
+
+#[tokio::test]
+async fn tables_arrive_over_an_interface() {
+    let Ok(name) = std::env::var("BENDERD_CAN") else {
+        println!(
+            "skipped: BENDERD_CAN names no CAN interface (`ip link add dev vcan0 type vcan mtu 72`, `ip link set vcan0 up`)"
+        );
+        return;
+    };
+    for way in WAYS {
+        if way.2 == "fd = true" && Socket::open(&name, true).is_err() {
+            println!("skipped: {name} carries no CAN FD");
+            continue;
+        }
+        deliveries(Meeting::Interface(name.clone()), way).await;
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_commit_whose_echo_is_lost_is_found_out_by_reading() {
+    for (name, from, to) in [WAYS[0], WAYS[2]] {
+        let profile = profile((name, from, to));
+        for (fault, applied) in [(Fault::DropAfterApply, true), (Fault::DropBeforeApply, false)] {
+            let meeting = Meeting::Memory(MemoryBus::new());
+            let machine = Machine::start(&meeting, &profile, Some(fault));
+            let mut log = Memory::default();
+            let outcome = deliver(&mut meeting.link(&profile), &job(100.0), &mut log).await;
+            assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
+            assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
+            assert_eq!((machine.active().revision == 1, log.0.len()), (applied, 1));
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn after_bus_off_and_after_an_adapter_was_pulled_out_the_link_comes_back() {
+    for way in [WAYS[0], WAYS[2]] {
+        let profile = profile(way);
+        let bus = MemoryBus::new();
+        let meeting = Meeting::Memory(bus.clone());
+        let _machine = Machine::start(&meeting, &profile, None);
+        let mut link = meeting.link(&profile);
+        link.read_status().await.unwrap();
+        bus.bus_off("can0");
+        let text = link.read_status().await.unwrap_err().to_string();
+        assert!(
+            text.contains("not connected") || text.contains("bus-off") || text.contains("status"),
+            "{text}"
+        );
+        bus.restart("can0");
+        come_back(&mut link).await;
+        bus.vanish("can0");
+        let text = link.read_status().await.unwrap_err().to_string();
+        assert!(text.contains("No such device"), "{text}");
+        bus.reappear("can0");
+        come_back(&mut link).await;
+        let outcome = deliver(&mut link, &job(100.0), &mut Memory::default()).await;
+        assert!(matches!(outcome, Outcome::Applied(_)), "{way:?}: {outcome:?}");
+    }
+}
+
+/// The link's waits between attempts are over within a few seconds.
+async fn come_back(link: &mut Link) {
+    for _ in 0..10 {
+        if link.read_status().await.is_ok() {
+            return;
+        }
+        tokio::time::advance(Duration::from_secs(1)).await;
+    }
+    panic!("the link does not come back");
+}
+
+#[tokio::test(start_paused = true)]
+async fn another_machine_on_the_bus_is_not_written_to() {
+    let mut other = profile(WAYS[0]);
+    other.identification = 0x4F54_4852;
+    let meeting = Meeting::Memory(MemoryBus::new());
+    let machine = Machine::start(&meeting, &other, None);
+    let outcome = deliver(&mut meeting.link(&profile(WAYS[0])), &job(100.0), &mut Memory::default()).await;
+    assert!(format!("{outcome:?}").contains("not this machine"), "{outcome:?}");
+    assert!(machine.model.lock().unwrap().staging_is_empty());
+}
