@@ -2,6 +2,7 @@
 //! vcan, say) the same once more over the socket; a bus-off and an adapter that is pulled out on the way.
 
 #![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
+#![allow(clippy::print_stdout)] // a test that skips says why, and how long a delivery took
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;

@@ -157,7 +157,7 @@ mod tests {
         );
         assert!(
             complaint(CANOPEN, "endpoint = \"can0\"", "endpoint = \"0123456789abcdef\"")
-                .contains("15 characters")
+                .contains("up to 14 letters and digits")
         );
     }
 

@@ -11,7 +11,7 @@ use super::can_table::CanSettings;
 use super::direct::DirectMap;
 use super::registers::ModbusMap;
 use super::sdo::CanopenSettings;
-use crate::config::{HOST_PORT, is_device, is_host_port};
+use crate::config::{HOST_PORT, is_device, is_host_port, is_interface};
 
 /// Which link leads to the machine.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,14 +30,6 @@ pub enum Transport {
     Can(CanSettings),
     /// Objects of a dictionary on CANopen.
     Canopen(CanopenSettings),
-}
-
-/// Longest name of a network interface.
-const INTERFACE_CHARACTERS: usize = 15;
-
-fn is_interface(endpoint: &str) -> bool {
-    let fits = (1..=INTERFACE_CHARACTERS).contains(&endpoint.len());
-    fits && endpoint.bytes().all(|b| b.is_ascii_graphic() && b != b'/' && b != b':')
 }
 
 impl Transport {
@@ -60,7 +52,7 @@ impl Transport {
             }
             Transport::Folder(_) => "the path of a folder, from the root: \"/srv/benders\"",
             Transport::Can(_) | Transport::Canopen(_) => {
-                "the name of a CAN interface: \"can0\", 1 to 15 characters"
+                "the name of a CAN interface, \"can0\": a letter, then up to 14 letters and digits"
             }
         }
     }

@@ -133,10 +133,10 @@ fn parse_cell(doc: &Document, raw: &RawCell, base: &Path) -> Result<CellConfig, 
         return Err(doc.value_error(raw.name.span(), "cell.name", format!("{name:?}"), allowed));
     }
     let address = raw.address.get_ref();
-    // Which of the two the machine's profile asks for is seen when that is read.
-    if !is_host_port(address) && !is_device(address) {
+    // Which of them the machine's profile asks for is seen when that is read.
+    if !is_host_port(address) && !is_device(address) && !is_interface(address) {
         let key = format!("cell {name} address");
-        let allowed = format!("{HOST_PORT}, or the path of a serial port");
+        let allowed = format!("{HOST_PORT}, the path of a serial port, or the name of a CAN interface");
         return Err(doc.value_error(raw.address.span(), &key, format!("{address:?}"), allowed));
     }
     let settle_s = match &raw.scan.settle_s {
@@ -167,6 +167,12 @@ pub fn is_host_port(text: &str) -> bool {
 /// Whether a text has the form of a device's path; the device is not looked up.
 pub fn is_device(text: &str) -> bool {
     text.starts_with('/') && text.len() > 1 && !text.chars().any(char::is_control)
+}
+
+/// Whether a text has the form of a CAN interface's name: up to 15 letters and digits after a letter; it is not looked up.
+pub fn is_interface(text: &str) -> bool {
+    let usual = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.');
+    text.len() <= 15 && text.starts_with(|c: char| c.is_ascii_alphabetic()) && text.bytes().all(usual)
 }
 
 /// What looks like a file is one; any other word is a built-in profile's name.

@@ -12,7 +12,8 @@ mod tables;
 
 pub use at::At;
 pub use daemon::{
-    CellConfig, DaemonConfig, HOST_PORT, Mode, ScanUnit, is_device, is_host_port, load_daemon, parse_daemon,
+    CellConfig, DaemonConfig, HOST_PORT, Mode, ScanUnit, is_device, is_host_port, is_interface, load_daemon,
+    parse_daemon,
 };
 pub use document::{ConfigError, Document};
 pub use materials::Materials;

@@ -1,6 +1,6 @@
 //! An upload: an object's bytes, expedited, by segments, or in blocks of up to 127 segments, of which the last good one is acknowledged.
 
-use super::codes::{CHECKSUM, LENGTH, NO_MEMORY, TOGGLE, crc16};
+use super::codes::{CHECKSUM, LENGTH, NO_MEMORY, SEQUENCE, TOGGLE, crc16};
 use super::dialogue::{Bytes, Dialogue, Transfer, number};
 use crate::bender::can::Frame;
 use crate::bender::exchange::Action;
@@ -116,11 +116,17 @@ impl Upload {
             }
         }
         self.state = State::Block { good, last };
-        if number == BLOCK || is_last {
-            self.acknowledge(good, last, dialogue, now_ms)
-        } else {
-            dialogue.wait_anew(now_ms)
+        if number != BLOCK && !is_last {
+            return dialogue.wait_anew(now_ms);
         }
+        if good == 0 {
+            self.stuck += 1;
+            if self.stuck > STUCK {
+                let why = format!("of {} blocks in a row nothing came in order", self.stuck);
+                return dialogue.abort(SEQUENCE, &why, now_ms);
+            }
+        }
+        self.acknowledge(good, last, dialogue, now_ms)
     }
 
     /// Says how far the block is good; the next one begins behind that.
