@@ -4,22 +4,18 @@
 #![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
 #![allow(clippy::print_stdout)] // a test that skips says why, and how long a delivery took
 
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use benderd::bender::can::{Bus, CanPort, MemoryBus, Socket, open_port};
 use benderd::bender::{
-    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Port as _, Profile, TableId, Transport,
-    deliver,
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, Transport, deliver,
 };
 use benderd::config::Document;
 use benderd::sim::bender::MachineModel;
-use benderd::sim::can_station::CanStation;
+use benderd::sim::bender_server::SimulatedBender;
+use benderd::sim::door::Door;
 use benderd::sim::faults::Fault;
-use benderd::sim::sdo_server::SdoServer;
-use benderd::sim::station::{Controller, Station};
 use benderd::tube::{CommandRow, CommandTable};
-use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 /// Profiles of every way over a bus.
@@ -71,73 +67,12 @@ impl Meeting {
 }
 
 /// A machine on the bus, until it is dropped.
-struct Machine {
-    model: Arc<Mutex<MachineModel>>,
-    task: JoinHandle<()>,
-}
-
-impl Drop for Machine {
-    fn drop(&mut self) {
-        self.task.abort();
-    }
-}
-
-impl Machine {
-    fn start(meeting: &Meeting, profile: &Profile, fault: Option<Fault>) -> Machine {
-        let model = Arc::new(Mutex::new(MachineModel::new(profile.clone(), "P1", 3)));
-        let task = match profile.transport.clone() {
-            Transport::Can(can) => tokio::spawn(serve(
-                meeting.machine_port(can.fd),
-                CanStation::new(),
-                Arc::clone(&model),
-                fault,
-            )),
-            Transport::Canopen(canopen) => tokio::spawn(serve(
-                meeting.machine_port(false),
-                SdoServer::new(canopen),
-                Arc::clone(&model),
-                fault,
-            )),
-            other => panic!("{other:?}"),
-        };
-        Machine { model, task }
-    }
-
-    fn active(&self) -> TableId {
-        self.model.lock().unwrap().active()
-    }
-}
-
-/// Takes frames off the bus, and runs a program cycle every 10 ms.
-async fn serve(
-    mut port: CanPort,
-    mut station: impl Station<Piece = benderd::bender::can::Frame>,
-    model: Arc<Mutex<MachineModel>>,
-    fault: Option<Fault>,
-) {
-    let (mut interval, mut mute) = (tokio::time::interval(Duration::from_millis(10)), false);
-    loop {
-        let heard = tokio::select! {
-            heard = port.receive() => Some(heard.unwrap()),
-            _ = interval.tick() => None,
-        };
-        let answers = {
-            let mut model = model.lock().unwrap();
-            let ticks = heard.is_none();
-            let mut controller = Controller { model: &mut model, fault, mute: &mut mute };
-            let answers = match heard {
-                Some(frame) => station.hear(frame, &mut controller),
-                None => station.cycle(&mut controller),
-            };
-            if ticks {
-                model.tick();
-            }
-            answers
-        };
-        for answer in answers {
-            port.send(answer).await.unwrap();
-        }
-    }
+fn machine(meeting: &Meeting, profile: &Profile, fault: Option<Fault>) -> SimulatedBender {
+    let fd = matches!(&profile.transport, Transport::Can(can) if can.fd);
+    let place = meeting.clone();
+    let door =
+        Door::Bus(Box::new(move || Ok(place.machine_port(fd))), "bus".into(), Box::new(profile.clone()));
+    SimulatedBender::start(door, MachineModel::new(profile.clone(), "P1", 3), fault, |_| ()).unwrap()
 }
 
 #[derive(Default)]
@@ -157,22 +92,22 @@ impl IntentLog for Memory {
 fn job(length_mm: f64) -> Job {
     let row = CommandRow { length_mm, rotation_rad: -0.5, angle_rad: 1.25 };
     let table = CommandTable { bends: vec![row; 3], last_length_mm: 50.0 };
-    Job { program: "P1".into(), table, expected_active: None }
+    Job { program: "P1".into(), table, expected_active: None, operation: Operation::New, approved: false }
 }
 
 /// One delivery after the other; the second is the table in force when the machine says so.
 async fn deliveries(meeting: Meeting, way: (&str, &str, &str)) {
     let profile = profile(way);
-    let machine = Machine::start(&meeting, &profile, None);
+    let machine = machine(&meeting, &profile, None);
     let mut link = meeting.link(&profile);
     for (revision, length_mm) in [(1, 100.0), (2, 120.5)] {
         let mut log = Memory::default();
         let begun = Instant::now();
         let outcome = deliver(&mut link, &job(length_mm), &mut log).await;
         assert!(matches!(outcome, Outcome::Applied(_)), "{way:?}: {outcome:?}");
-        assert_eq!((machine.active().revision, log.0.len()), (revision, 1));
+        assert_eq!((machine.with(|m| m.active()).revision, log.0.len()), (revision, 1));
         let active = link.read_active().await.unwrap();
-        assert_eq!(active.payload, machine.model.lock().unwrap().active_payload());
+        assert_eq!(active.payload, machine.with(|m| m.active_payload()));
         println!("{} {}: a table of 3 bends in {} ms", way.0, way.2, begun.elapsed().as_millis());
     }
     let outcome = deliver(&mut link, &job(120.5), &mut Memory::default()).await;
@@ -209,12 +144,12 @@ async fn a_commit_whose_echo_is_lost_is_found_out_by_reading() {
         let profile = profile((name, from, to));
         for (fault, applied) in [(Fault::DropAfterApply, true), (Fault::DropBeforeApply, false)] {
             let meeting = Meeting::Memory(MemoryBus::new());
-            let machine = Machine::start(&meeting, &profile, Some(fault));
+            let machine = machine(&meeting, &profile, Some(fault));
             let mut log = Memory::default();
             let outcome = deliver(&mut meeting.link(&profile), &job(100.0), &mut log).await;
             assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
             assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
-            assert_eq!((machine.active().revision == 1, log.0.len()), (applied, 1));
+            assert_eq!((machine.with(|m| m.active()).revision == 1, log.0.len()), (applied, 1));
         }
     }
 }
@@ -225,7 +160,7 @@ async fn after_bus_off_and_after_an_adapter_was_pulled_out_the_link_comes_back()
         let profile = profile(way);
         let bus = MemoryBus::new();
         let meeting = Meeting::Memory(bus.clone());
-        let _machine = Machine::start(&meeting, &profile, None);
+        let _machine = machine(&meeting, &profile, None);
         let mut link = meeting.link(&profile);
         link.read_status().await.unwrap();
         bus.bus_off("can0");
@@ -262,8 +197,8 @@ async fn another_machine_on_the_bus_is_not_written_to() {
     let mut other = profile(WAYS[0]);
     other.identification = 0x4F54_4852;
     let meeting = Meeting::Memory(MemoryBus::new());
-    let machine = Machine::start(&meeting, &other, None);
+    let machine = machine(&meeting, &other, None);
     let outcome = deliver(&mut meeting.link(&profile(WAYS[0])), &job(100.0), &mut Memory::default()).await;
     assert!(format!("{outcome:?}").contains("not this machine"), "{outcome:?}");
-    assert!(machine.model.lock().unwrap().staging_is_empty());
+    assert!(machine.with(|m| m.staging_is_empty()));
 }

@@ -129,7 +129,8 @@ async fn apart<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 
 
 /// All of it under this name, or nothing.
 fn put(name: &Path, bytes: &[u8]) -> io::Result<()> {
-    let new = name.with_added_extension("new");
+    let mut new = name.as_os_str().to_owned();
+    new.push(".new");
     let mut file = File::create(&new)?;
     file.write_all(bytes)?;
     file.sync_all()?;

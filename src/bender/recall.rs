@@ -79,9 +79,9 @@ fn differences(profile: &Profile, last: &CommandTable, held: &CommandTable) -> V
     };
     let rows = steps_of(table, last).into_iter().zip(steps_of(table, held));
     for (i, (committed, found)) in rows.enumerate() {
-        for column in 0..3 {
-            let (name, moves) = (&table.columns[column], (committed.moves[column], found.moves[column]));
-            compare(Some(i + 1), name, units[column], moves.0, moves.1);
+        let values = committed.moves.into_iter().zip(found.moves);
+        for ((name, unit), (committed, found)) in table.columns.iter().zip(units).zip(values) {
+            compare(Some(i + 1), name, unit, committed, found);
         }
     }
     let tail = |t: &CommandTable| (t.last_length_mm / table.length_resolution_mm).round();

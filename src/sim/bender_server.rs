@@ -2,19 +2,26 @@
 
 use std::io;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::bender::{MachineEvent, MachineModel};
+use super::can_station::CanStation;
 use super::door::{Door, Speech};
 use super::faults::{Fault, WireFaults};
 use super::folder_station::FolderStation;
 use super::frames::Framing;
 use super::modbus_station::ModbusStation;
+use super::sdo_server::SdoServer;
 use super::serial_station::SerialStation;
 use super::serve::{CYCLE, Shared, WirePort, lock, serve};
+use crate::bender::Transport;
+
+/// A bus that was lost is tried again after this.
+const REJOIN: Duration = Duration::from_millis(100);
 
 /// A running simulated bender; stops when dropped.
 #[derive(Debug)]
@@ -89,6 +96,16 @@ async fn serve_door(door: Door, shared: Arc<Shared>) {
     match door {
         Door::Line(speech, wire, _) => serve_wire(wire, speech, &shared).await,
         Door::Folder(port, _, profile) => serve(port, FolderStation::new(*profile), &shared).await,
+        Door::Bus(mut join, _, profile) => loop {
+            match (join(), &profile.transport) {
+                (Ok(port), Transport::Canopen(settings)) => {
+                    serve(port, SdoServer::new(settings.clone()), &shared).await;
+                }
+                (Ok(port), _) => serve(port, CanStation::new(), &shared).await,
+                (Err(_), _) => {} // away; it may come back
+            }
+            tokio::time::sleep(REJOIN).await;
+        },
         Door::Memory(speech, mut wires) => {
             while let Some(wire) = wires.recv().await {
                 serve_wire(wire, speech, &shared).await;

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 use tokio::io::DuplexStream;
 use tokio::net::TcpListener;
@@ -10,6 +11,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use super::frames::Framing;
 use super::pty::{Kept, machine_end};
 use super::serve::CYCLE;
+use crate::bender::can::{CanPort, open_port};
 use crate::bender::{FolderPort, Profile, Transport, Wire};
 
 /// A door that is open.
@@ -22,7 +24,15 @@ pub enum Door {
     Memory(Speech, UnboundedReceiver<DuplexStream>),
     /// The machine's end of a folder, which people know by this name, and what kind of machine.
     Folder(FolderPort, String, Box<Profile>),
+    /// A place on a bus, which people know by this name; taken anew when it is lost.
+    Bus(BusDoor, String, Box<Profile>),
 }
+
+/// Takes a place on a bus.
+pub type BusDoor = Box<dyn FnMut() -> io::Result<CanPort> + Send>;
+
+/// How long a full bus is waited for.
+const BUS_PATIENCE: Duration = Duration::from_secs(1);
 
 /// What is spoken on a wire of bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,24 +50,21 @@ impl Speech {
             Transport::ModbusTcp(_) => Some(Speech::Modbus(Framing::Tcp)),
             Transport::ModbusRtu(..) | Transport::ModbusRtuOverTcp(..) => Some(Speech::Modbus(Framing::Rtu)),
             Transport::SerialTable(unit, ..) => Some(Speech::SerialTable(*unit)),
-            Transport::Folder(_) => None,
+            Transport::Folder(_) | Transport::Can(_) | Transport::Canopen(_) => None,
         }
     }
 }
 
 impl Door {
     /// Opens where a machine of this profile is reached, and what must be kept meanwhile: a host and port, the path of a serial
-    /// port ([`machine_end`]), a folder. Must be called inside a tokio runtime.
+    /// port ([`machine_end`]), a folder, a CAN interface. Must be called inside a tokio runtime.
     pub async fn open(profile: &Profile, on: &str) -> io::Result<(Door, Option<Kept>)> {
         Ok(match &profile.transport {
             Transport::ModbusTcp(_) => (Door::Socket(Framing::Tcp, TcpListener::bind(on).await?), None),
             Transport::ModbusRtuOverTcp(..) => {
                 (Door::Socket(Framing::Rtu, TcpListener::bind(on).await?), None)
             }
-            // wip: the server of stations puts them there
-            Transport::Can(_) | Transport::Canopen(_) => {
-                return Err(io::Error::new(io::ErrorKind::Unsupported, "no simulated bender on CAN yet"));
-            }
+            Transport::Can(_) | Transport::Canopen(_) => (Door::interface(profile, on)?, None),
             Transport::ModbusRtu(.., settings) => {
                 let end = machine_end(Path::new(on), settings)?;
                 (Door::Line(Speech::Modbus(Framing::Rtu), Box::new(end.wire), on.to_owned()), end.kept)
@@ -70,6 +77,15 @@ impl Door {
         })
     }
 
+    /// A CAN interface of this computer.
+    fn interface(profile: &Profile, on: &str) -> io::Result<Door> {
+        let fd = matches!(&profile.transport, Transport::Can(can) if can.fd);
+        let name = on.to_owned();
+        let join = move || open_port(&name, None, fd, BUS_PATIENCE);
+        drop(join()?); // what is wrong with it shows at once
+        Ok(Door::Bus(Box::new(join), on.to_owned(), Box::new(profile.clone())))
+    }
+
     /// The machine's end of a folder.
     pub fn folder(profile: &Profile, number: u16, on: &str) -> io::Result<Door> {
         let port = FolderPort::of_machine(Path::new(on), number, CYCLE, profile.deadlines.request)?;
@@ -80,7 +96,7 @@ impl Door {
     pub fn address(&self) -> io::Result<String> {
         Ok(match self {
             Door::Socket(_, listener) => listener.local_addr()?.to_string(),
-            Door::Line(_, _, name) | Door::Folder(_, name, _) => name.clone(),
+            Door::Line(_, _, name) | Door::Folder(_, name, _) | Door::Bus(_, name, _) => name.clone(),
             Door::Memory(..) => "in memory".to_owned(),
         })
     }

@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::bender::MachineModel;
 use crate::bender::Letter;
+use crate::bender::can::Frame;
 
 /// A way to misbehave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -210,6 +211,17 @@ impl Damaged for Letter {
                 *file = bytes;
                 vec![self]
             }
+        }
+    }
+}
+
+impl Damaged for Frame {
+    /// What is damaged on a bus is thrown away by every controller on it: it is lost.
+    fn damaged(self, fault: ReplyFault, _: &mut WireFaults) -> Vec<Frame> {
+        match fault {
+            ReplyFault::Late { .. } => vec![self],
+            ReplyFault::Twice => vec![self.clone(), self],
+            _ => Vec::new(),
         }
     }
 }

@@ -14,6 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use tokio::sync::mpsc;
 
 use super::TrialError;
+use crate::bender::can::{Bus, CanPort, MemoryBus};
 use crate::bender::{
     Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, TableId, Transport,
     Wire, crc_of, deliver, encode_payload,
@@ -27,6 +28,9 @@ use crate::tube::{CommandRow, CommandTable};
 
 /// Room for bytes on a wire in memory.
 const WIRE_BYTES: usize = 4096;
+
+/// How long a full bus is waited for.
+const BUS_PATIENCE: Duration = Duration::from_secs(1);
 
 /// The program that the machine has loaded.
 const PROGRAM: &str = "P1";
@@ -104,6 +108,9 @@ pub fn in_memory(profile: &Profile, folder: &Path) -> Result<Ends, TrialError> {
         let door = Door::folder(profile, number, &on)?;
         return Ok(Ends { door, link: Link::new(profile.clone(), on)? });
     }
+    if matches!(profile.transport, Transport::Can(_) | Transport::Canopen(_)) {
+        return on_bus(profile);
+    }
     let (made, wires) = mpsc::unbounded_channel();
     let open = move || {
         let (here, there) = tokio::io::duplex(WIRE_BYTES);
@@ -116,10 +123,21 @@ pub fn in_memory(profile: &Profile, folder: &Path) -> Result<Ends, TrialError> {
     Ok(Ends { door: Door::Memory(speech, wires), link })
 }
 
-/// The transport's own: a socket, a pseudo terminal in this folder, the folder itself.
+/// A CAN bus in memory.
+fn on_bus(profile: &Profile) -> Result<Ends, TrialError> {
+    let bus = MemoryBus::new();
+    let machine = bus.clone();
+    let join = move || Ok(CanPort::new(Box::new(machine.join("machine")?), "machine", BUS_PATIENCE));
+    let open = move |name: &str| Ok(Box::new(bus.join(name)?) as Box<dyn Bus>);
+    let link = Link::on_bus(profile.clone(), "can0", Box::new(open))?;
+    Ok(Ends { door: Door::Bus(Box::new(join), "in memory".into(), Box::new(profile.clone())), link })
+}
+
+/// The transport's own: a socket, a pseudo terminal in this folder, the folder itself, the profile's CAN interface.
 pub async fn real(profile: &Profile, folder: &Path) -> Result<(Ends, Option<Kept>), TrialError> {
     let on = match &profile.transport {
         Transport::Folder(_) => folder.display().to_string(),
+        Transport::Can(_) | Transport::Canopen(_) => profile.endpoint.clone(),
         transport if transport.serial().is_some() => folder.join("line").display().to_string(),
         _ => "127.0.0.1:0".to_owned(),
     };
@@ -140,7 +158,7 @@ pub async fn run(
     let encode = |table: &CommandTable| encode_payload(profile, PROGRAM, table).unwrap_or_default();
     let last = table(&mut rng, bends);
     let old = encode(&last);
-    let operation = if seed % 2 == 0 { Operation::Correct { last } } else { Operation::New };
+    let operation = if seed.is_multiple_of(2) { Operation::Correct { last } } else { Operation::New };
     let job = Job {
         program: PROGRAM.into(),
         table: table(&mut rng, bends),

@@ -234,8 +234,12 @@ impl Shop {
             let mut mute = false;
             for piece in pieces {
                 if self.arrives() {
-                    let mut controller =
-                        Controller { model: &mut self.model, fault: self.fault, mute: &mut mute };
+                    let mut controller = Controller {
+                        model: &mut self.model,
+                        fault: self.fault,
+                        mute: &mut mute,
+                        hangs_up: false,
+                    };
                     waiting.extend(self.server.hear(piece, &mut controller));
                 }
             }
@@ -248,8 +252,12 @@ impl Shop {
                     break Event::Timeout;
                 } else {
                     self.now_ms += 10;
-                    let mut controller =
-                        Controller { model: &mut self.model, fault: self.fault, mute: &mut mute };
+                    let mut controller = Controller {
+                        model: &mut self.model,
+                        fault: self.fault,
+                        mute: &mut mute,
+                        hangs_up: false,
+                    };
                     waiting.extend(self.server.cycle(&mut controller));
                 }
             };
@@ -345,7 +353,7 @@ proptest! {
         let mut shop = Shop::new(1, 0, true);
         let mut mute = false;
         for request in requests {
-            let mut controller = Controller { model: &mut shop.model, fault: None, mute: &mut mute };
+            let mut controller = Controller { model: &mut shop.model, fault: None, mute: &mut mute, hangs_up: false };
             shop.server.hear(Frame::new(FrameId::Standard(0x605), request), &mut controller);
             shop.server.cycle(&mut controller);
         }
