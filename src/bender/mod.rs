@@ -24,6 +24,9 @@
 //! status_image  the status as one row of bytes
 //!
 //! line          a line under it all: no old reply is taken for a new one
+//! ring          the last frames of a link; recording feeds it
+//!
+//! selftest      whether a real machine is what its profile says, and what to change; selftest_advice: in words
 //! ```
 
 mod any_link;
@@ -46,8 +49,14 @@ mod profile;
 mod profile_file;
 mod profile_modbus;
 mod profile_transport;
+mod recording;
 mod registers;
+mod ring;
 mod rs485;
+pub mod selftest;
+mod selftest_advice;
+mod selftest_endpoint;
+mod selftest_judge;
 mod serial_frame;
 mod serial_table;
 mod status_image;
@@ -69,7 +78,9 @@ pub use link::{ActiveTable, Bender, LinkError};
 pub use open::{Opener, serial_port};
 pub use profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
+pub use recording::Frames;
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
+pub use ring::{Content, Direction};
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{

@@ -19,6 +19,7 @@ use super::link::{ActiveTable, Bender, LinkError};
 use super::open::{Connection, Opener, open};
 use super::plan;
 use super::profile::Profile;
+use super::recording::Frames;
 use super::registers::{ModbusMap, decode_status};
 use super::transport::Transport;
 use super::wire::{Staged, Status, TableId, commit_image, crc_of, payload_bytes, staging_image};
@@ -38,6 +39,7 @@ pub struct ModbusLink {
     map: ModbusMap,
     opener: Option<Opener>,
     caller: Caller<Connection>,
+    frames: Frames,
     /// When something was last heard.
     heard: Instant,
 }
@@ -54,7 +56,7 @@ impl ModbusLink {
         let silence_ms = profile.transport.line().map(|line| millis(line.quiet));
         let asking_ms = millis(profile.deadlines.request);
         let caller = Caller::new(endpoint, &profile.deadlines, asking_ms, silence_ms)?;
-        Ok(ModbusLink { profile, map, opener, caller, heard: Instant::now() })
+        Ok(ModbusLink { profile, map, opener, caller, frames: Frames::default(), heard: Instant::now() })
     }
 
     /// Opens the connection if need be, and lets a line be silent; until when a reply is waited for.
@@ -69,7 +71,8 @@ impl ModbusLink {
                 Next::Send(until) => return Ok(until),
                 Next::Open(until) => {
                     let endpoint = self.caller.endpoint().to_owned();
-                    let opening = open(&self.profile, self.map.unit_id, &endpoint, self.opener.as_mut());
+                    let opener = self.opener.as_mut();
+                    let opening = open(&self.profile, self.map.unit_id, &endpoint, opener, &self.frames);
                     self.caller.open(until, opening).await?;
                 }
             }
@@ -156,6 +159,10 @@ impl Bender for ModbusLink {
 
     fn reset(&mut self) {
         self.caller.perform(Event::Reset);
+    }
+
+    fn last_frames(&self) -> Vec<String> {
+        self.frames.lines()
     }
 
     async fn read_status(&mut self) -> Result<Status, LinkError> {
