@@ -208,7 +208,7 @@ impl Test<'_> {
         };
         let answered = matches!(error, LinkError::Nonsense { .. } | LinkError::Exception { .. });
         if answered {
-            self.note(Step::ok("first answer", format!("after {first_ms:.0} ms")).with("first_ms", first_ms));
+            self.note(Step::ok("first answer", format!("after {first_ms:.1} ms")).with("first_ms", first_ms));
             let guesses = [others(&self.profile), silent_ones(&self.profile)].concat();
             let advice = self.first_that_explains(guesses).await;
             self.note(judge::foreign(&self.profile, &error, advice));

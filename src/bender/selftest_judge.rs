@@ -32,7 +32,7 @@ pub fn profile(profile: &Profile) -> Step {
 /// How fast it answers.
 pub fn first_answer(first_ms: f64, times: &Times) -> Step {
     let Times { median, worst, .. } = *times;
-    let found = format!("after {first_ms:.0} ms; 20 more: median {median:.1} ms, worst {worst:.1} ms");
+    let found = format!("after {first_ms:.1} ms; 20 more: median {median:.1} ms, worst {worst:.1} ms");
     Step::ok("first answer", found)
         .with("first_ms", first_ms)
         .with("median_ms", median)
@@ -256,7 +256,7 @@ pub fn staging(profile: &Profile, bytes: usize, read: Result<Vec<u8>, LinkError>
     match read {
         Ok(found) => {
             let holds = if found.iter().all(|b| *b == 0) { "empty" } else { "holds a table that was staged" };
-            Step::ok("staging area", format!("{} bytes read in {ms:.0} ms, {holds}", found.len()))
+            Step::ok("staging area", format!("{} bytes read in {ms:.1} ms, {holds}", found.len()))
                 .with("read_ms", ms)
         }
         Err(error) => {
@@ -341,7 +341,7 @@ pub fn times(profile: &Profile, times: &Times) -> Step {
     let delivery_ms =
         3.0 * times.median + write + times.read + 2.0 * times.active.max(times.median + times.read);
     let found = format!(
-        "the slowest answer took {:.0} ms of deadlines.request_ms = {request_ms}; a delivery of {} bends will take about {:.1} s",
+        "the slowest answer took {:.1} ms of deadlines.request_ms = {request_ms}; a delivery of {} bends will take about {:.2} s",
         times.worst,
         profile.limits.max_bends,
         delivery_ms / 1000.0
@@ -411,6 +411,6 @@ mod tests {
         let times_of = |worst| Times { median: 5.0, worst, read: 40.0, write: None, active: 30.0 };
         assert!(advice(&times(&reference(), &times_of(700.0))).contains("deadlines.request_ms = 2100"));
         let good = times(&reference(), &times_of(20.0));
-        assert!(good.found.contains("about 0.2 s"), "{good:?}");
+        assert!(good.found.contains("40 bends will take about 0.1"), "{good:?}");
     }
 }

@@ -29,6 +29,10 @@ pub struct Controller<'a> {
     pub fault: Option<Fault>,
     /// Answers nothing any more.
     pub mute: &'a mut bool,
+    /// Has no time, this once.
+    pub busy: bool,
+    /// A commit was written.
+    pub committed: bool,
     /// The connection is to be cut.
     pub hangs_up: bool,
 }
@@ -36,7 +40,7 @@ pub struct Controller<'a> {
 impl Controller<'_> {
     /// Whether it has no time.
     pub fn is_busy(&self) -> bool {
-        self.fault == Some(Fault::Busy)
+        self.busy || self.fault == Some(Fault::Busy)
     }
 
     /// Whether it hears nothing.
@@ -52,6 +56,7 @@ impl Controller<'_> {
         }
         if self.fault != Some(Fault::DropBeforeApply) {
             self.model.write_commit(id);
+            self.committed = true;
         }
         !self.hangs_up && !*self.mute
     }
