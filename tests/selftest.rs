@@ -177,8 +177,8 @@ async fn what_is_wrong_at_the_machine_says_what_to_do() {
         "{text}"
     );
 
-    let late = on_socket(Some(Fault::Late { ms: 60 })).await;
-    let hasty = changed(folder.path(), &[("request_ms = 1000", "request_ms = 100")]);
+    let late = on_socket(Some(Fault::Late { ms: 150 })).await;
+    let hasty = changed(folder.path(), &[("request_ms = 1000", "request_ms = 250")]);
     let text = said(&selftest(&hasty, late.address(), &[]).await, 1);
     let times = step(&text, "times");
     assert!(times.contains("too near to the limit: set deadlines.request_ms = "), "{text}");

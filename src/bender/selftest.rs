@@ -138,7 +138,10 @@ impl Test<'_> {
         let Some(status) = self.understand().await else {
             return self.skip(&AFTER, "what is read there would mean nothing");
         };
-        let step = self.heartbeat(&status).await;
+        let step = match self.heartbeat().await {
+            Ok(step) => step,
+            Err(error) => Step::failed("heartbeat", error.to_string(), "look at cable and plugs"),
+        };
         self.note(step);
         for step in judge::state_bits(&self.profile, status.state) {
             self.note(step);
@@ -251,26 +254,22 @@ impl Test<'_> {
         None
     }
 
-    async fn heartbeat(&mut self, first: &Status) -> Step {
+    async fn heartbeat(&mut self) -> Result<Step, LinkError> {
         let limit_ms = self.profile.deadlines.heartbeat_ms;
         let poll = Duration::from_millis(self.profile.deadlines.poll_ms);
-        let (begun, mut before) = (Instant::now(), first.heartbeat);
+        let mut before = self.link.read_status().await?.heartbeat;
+        let begun = Instant::now();
         let (mut beats, mut beaten, mut longest_ms) = (0_u32, begun, 0.0_f64);
         while begun.elapsed() < Duration::from_millis(limit_ms) {
             tokio::time::sleep(poll).await;
-            let status = match self.link.read_status().await {
-                Ok(status) => status,
-                Err(error) => {
-                    return Step::failed("heartbeat", error.to_string(), "look at cable and plugs");
-                }
-            };
+            let now = self.link.read_status().await?.heartbeat;
             longest_ms = longest_ms.max(ms_since(beaten));
-            if status.heartbeat != before {
-                beats += u32::from(status.heartbeat.wrapping_sub(before));
-                (before, beaten) = (status.heartbeat, Instant::now());
+            if now != before {
+                beats += u32::from(now.wrapping_sub(before));
+                (before, beaten) = (now, Instant::now());
             }
         }
-        judge::heartbeat(&self.profile, beats, ms_since(begun), longest_ms)
+        Ok(judge::heartbeat(&self.profile, beats, ms_since(begun), longest_ms))
     }
 
     /// Whether one request may be as large as the profile says; if not, how large.

@@ -346,7 +346,11 @@ pub fn times(profile: &Profile, times: &Times) -> Step {
         profile.limits.max_bends,
         delivery_ms / 1000.0
     );
-    let step = if times.worst > NEAR * request_ms {
+    let step = if times.worst > request_ms {
+        let advice = "it came only when asked again: look at cable, plugs, shield and termination (--frames shows what \
+                      arrived); if the controller is as slow as that, raise deadlines.request_ms";
+        Step::failed("times", found, advice)
+    } else if times.worst > NEAR * request_ms {
         let least = (3.0 * times.worst).ceil();
         Step::failed(
             "times",
@@ -410,6 +414,7 @@ mod tests {
     fn slow_answers_say_which_deadline_to_change() {
         let times_of = |worst| Times { median: 5.0, worst, read: 40.0, write: None, active: 30.0 };
         assert!(advice(&times(&reference(), &times_of(700.0))).contains("deadlines.request_ms = 2100"));
+        assert!(advice(&times(&reference(), &times_of(1200.0))).contains("only when asked again"));
         let good = times(&reference(), &times_of(20.0));
         assert!(good.found.contains("40 bends will take about 0.1"), "{good:?}");
     }
