@@ -157,7 +157,7 @@ mod tests {
         assert!(later.len() == 1 && later[0].contains("add 1 to every address"), "{later:?}");
         let both = explained(1, &machine(WordOrder::Cdab, 0));
         assert!(both.len() == 1 && both[0].contains("subtract 1") && both[0].ends_with(&order("cdab")));
-        assert!(explained(0, &vec![0; 100]).is_empty(), "another machine");
+        assert!(explained(0, &[0; 100]).is_empty(), "another machine");
     }
 
     #[test]
