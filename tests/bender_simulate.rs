@@ -41,6 +41,33 @@ fn it_says_where_it_listens_logs_commits_and_stops_on_sigterm() {
 }
 
 #[test]
+fn what_a_script_says_is_printed_when_it_happens() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = folder.path().join("faults.toml");
+    let event = |text: &str| format!("[[event]]\n{text}\n");
+    let events = event("at_answer = 1\nwhat = \"late\"\nlate_ms = 5") + &event("at_ms = 0\nwhat = \"edit\"");
+    std::fs::write(&script, format!("version = 1\n{events}")).unwrap();
+    let mut bender = benderd()
+        .args(["simulate", "bender", "--on", "127.0.0.1:0", "--script", script.to_str().unwrap()])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = BufReader::new(bender.stdout.take().unwrap()).lines().map(Result::unwrap);
+    // The first may come before the machine has said where it listens.
+    let (two, edited): (Vec<String>, _) =
+        (said.by_ref().take(2).collect(), "trouble at 0 ms: another table entered");
+    assert!(two.iter().any(|line| line.starts_with(edited)), "{two:?}");
+    let listens = two.iter().find(|line| line.contains("listens on")).unwrap();
+    let address = listens.split("listens on ").nth(1).unwrap().split(';').next().unwrap();
+    let test =
+        benderd().args(["selftest", "--bender", "reference-modbus", "--on", address]).output().unwrap();
+    assert!(test.status.success(), "{}", String::from_utf8_lossy(&test.stdout));
+    assert_eq!(said.next().unwrap(), "trouble at answer 1: 5 ms late");
+    assert!(Command::new("kill").arg(bender.id().to_string()).status().unwrap().success());
+    assert!(bender.wait().unwrap().success());
+}
+
+#[test]
 fn push_goes_on_when_nobody_reads_what_it_says() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let profile = Profile::load("reference-modbus").unwrap();
@@ -71,6 +98,8 @@ fn what_cannot_be_simulated_is_one_clear_error() {
     for (args, said) in [
         (["--on", &address], "cannot listen"),
         (["--fault", "sulking"], "unknown fault \"sulking\", known are silent, late:MS"),
+        (["--script", "no-such-file.toml"], "no-such-file.toml: cannot be read"),
+        (["--per-mille", "5"], "--seed"),
         (["--fault", "late:soon"], "milliseconds must be a whole number"),
         (["--bends", "41"], "--bends 41: profile reference-modbus has room for 40"),
         (["--program", "Bügel"], "allowed are 1 to 32 ASCII characters"),

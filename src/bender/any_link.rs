@@ -115,6 +115,10 @@ impl Bender for Link {
         each!(self, link => link.reset());
     }
 
+    fn last_frames(&self) -> Vec<String> {
+        each!(self, link => link.last_frames())
+    }
+
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         each!(self, link => link.read_status().await)
     }

@@ -114,6 +114,10 @@ impl Bender for DirectLink {
         self.client.caller().perform(Event::Reset);
     }
 
+    fn last_frames(&self) -> Vec<String> {
+        self.client.frames().lines()
+    }
+
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         Ok(self.read_active().await?.status)
     }

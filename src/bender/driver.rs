@@ -47,11 +47,22 @@ pub async fn deliver<B: Bender>(bender: &mut B, job: &Job, log: &mut dyn IntentL
                 if let Err(error) = log.outcome(job, journalled.as_ref(), &outcome) {
                     tracing::error!(%error, ?outcome, "the outcome could not be journalled");
                 }
+                show_frames(bender, &outcome);
                 return outcome;
             }
         };
         let now_ms = u64::try_from(start.elapsed().as_millis()).unwrap_or(u64::MAX);
         action = delivery.on(event, now_ms);
+    }
+}
+
+/// What went over the link before a delivery that did not do what was wanted.
+fn show_frames<B: Bender>(bender: &B, outcome: &Outcome) {
+    let wanted = matches!(outcome, Outcome::Applied(_) | Outcome::AlreadyActive(_));
+    if !wanted && tracing::enabled!(tracing::Level::DEBUG) {
+        for line in bender.last_frames() {
+            tracing::debug!(endpoint = bender.endpoint(), "{line}");
+        }
     }
 }
 

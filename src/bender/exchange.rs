@@ -6,6 +6,7 @@
 use std::future::Future;
 use std::io;
 
+use super::recording::Frames;
 use super::wire::TableId;
 
 /// What is asked of the machine.
@@ -95,6 +96,9 @@ pub trait Protocol: Send {
 
     /// Begins an exchange.
     fn begin(&mut self, ask: &Ask) -> Box<dyn Exchange<Piece = <Self::Port as Port>::Piece>>;
+
+    /// Where its ports put what goes over them.
+    fn frames(&self) -> &Frames;
 
     /// Opens the port.
     fn open(&mut self, endpoint: &str) -> impl Future<Output = io::Result<Self::Port>> + Send;

@@ -12,12 +12,14 @@ use super::exchange::{Action, Ask, Event, Exchange, Failure, Protocol};
 use super::folder_port::{FolderPort, Letter};
 use super::folder_text::{Answer, Command, Said, TableText, Verb, read, table, written};
 use super::profile::Profile;
+use super::recording::Frames;
 
 /// The protocol in one folder.
 pub struct SharedFolder {
     profile: Profile,
     number: u16,
     sequence: u32,
+    frames: Frames,
 }
 
 impl SharedFolder {
@@ -25,7 +27,12 @@ impl SharedFolder {
     /// take an answer to the one before for its own.
     pub fn new(profile: &Profile, number: u16) -> SharedFolder {
         let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        SharedFolder { profile: profile.clone(), number, sequence: millis(since) as u32 }
+        SharedFolder {
+            profile: profile.clone(),
+            number,
+            sequence: millis(since) as u32,
+            frames: Frames::default(),
+        }
     }
 }
 
@@ -64,10 +71,15 @@ impl Protocol for SharedFolder {
         })
     }
 
+    fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
     async fn open(&mut self, endpoint: &str) -> io::Result<FolderPort> {
         let deadlines = &self.profile.deadlines;
         let look = std::time::Duration::from_millis(deadlines.poll_ms);
-        FolderPort::of_daemon(Path::new(endpoint), self.number, look, deadlines.transfer)
+        let port = FolderPort::of_daemon(Path::new(endpoint), self.number, look, deadlines.transfer)?;
+        Ok(port.recorded(self.frames.clone()))
     }
 }
 

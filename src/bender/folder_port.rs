@@ -12,6 +12,8 @@ use tokio::task::{JoinHandle, spawn_blocking};
 use tokio::time::{Instant, sleep_until};
 
 use super::exchange::Port;
+use super::recording::Frames;
+use super::ring::{Content, Direction};
 
 /// Longest file that is read: a table of the longest program takes a tenth.
 const LONGEST: u64 = 256 * 1024;
@@ -44,6 +46,7 @@ pub struct FolderPort {
     /// The next look, and the one that is under way: a call that is cancelled must not lose what it finds.
     next: Instant,
     looking: Option<JoinHandle<io::Result<Option<Letter>>>>,
+    frames: Option<Frames>,
 }
 
 impl FolderPort {
@@ -76,7 +79,28 @@ impl FolderPort {
         let name = |ending: &str| folder.join(format!("bender{number}.{ending}"));
         let [out, back] = endings.map(|(text, table)| Names { text: name(text), table: name(table) });
         let next = Instant::now();
-        Ok(FolderPort { folder: folder.to_owned(), out, back, look, oldest, next, looking: None })
+        Ok(FolderPort {
+            folder: folder.to_owned(),
+            out,
+            back,
+            look,
+            oldest,
+            next,
+            looking: None,
+            frames: None,
+        })
+    }
+
+    /// Keeps the letters that go through it there for a while.
+    pub fn recorded(mut self, frames: Frames) -> FolderPort {
+        self.frames = Some(frames);
+        self
+    }
+
+    fn record(&self, direction: Direction, letter: &Letter) {
+        if let Some(frames) = &self.frames {
+            frames.add(direction, Content::Text(in_one_line(letter)));
+        }
     }
 }
 
@@ -93,6 +117,7 @@ impl Port for FolderPort {
     }
 
     async fn send(&mut self, letter: Letter) -> io::Result<()> {
+        self.record(Direction::Sent, &letter);
         let (folder, names) = (self.folder.clone(), self.out.clone());
         apart(move || {
             if let Some(table) = &letter.table {
@@ -117,10 +142,19 @@ impl Port for FolderPort {
             self.looking = None;
             self.next = Instant::now() + self.look;
             if let Some(letter) = found.map_err(io::Error::other)?? {
+                self.record(Direction::Received, &letter);
                 return Ok(letter);
             }
         }
     }
+}
+
+/// A letter for people: what its text says, and how long its table is.
+fn in_one_line(letter: &Letter) -> String {
+    let text = String::from_utf8_lossy(&letter.text);
+    let lines: Vec<&str> = text.lines().filter(|line| !line.is_empty()).collect();
+    let table = letter.table.as_ref().map(|table| format!(" + table of {} bytes", table.len()));
+    lines.join("; ") + &table.unwrap_or_default()
 }
 
 async fn apart<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {

@@ -127,6 +127,11 @@ pub trait Bender: Send {
     /// Somebody has looked after the machine: one that was taken for another may be asked again.
     fn reset(&mut self);
 
+    /// The last frames that went either way, one line each, the oldest first; where the link keeps none, none.
+    fn last_frames(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// One look at the machine.
     fn read_status(&mut self) -> impl Future<Output = Result<Status, LinkError>> + Send;
 

@@ -27,6 +27,9 @@
 //! status_image  the status as one row of bytes
 //!
 //! line          a line under it all: no old reply is taken for a new one
+//! ring          the last frames of a link; recording feeds it
+//!
+//! selftest      whether a real machine is what its profile says, and what to change; selftest_advice: in words
 //! ```
 
 mod any_link;
@@ -56,10 +59,16 @@ mod profile_file;
 mod profile_modbus;
 mod profile_transport;
 mod recall;
+mod recording;
 mod registers;
+mod ring;
 mod rows;
 mod rs485;
 mod sdo;
+pub mod selftest;
+mod selftest_advice;
+mod selftest_endpoint;
+mod selftest_judge;
 mod serial_frame;
 mod serial_table;
 mod status_image;
@@ -85,7 +94,9 @@ pub use open::{Opener, serial_port};
 pub use profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
 pub use recall::{Operation, objections};
+pub use recording::Frames;
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
+pub use ring::{Content, Direction};
 pub use sdo::{Canopen, CanopenSettings, Object as SdoObject};
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};

@@ -46,6 +46,10 @@ impl Bender for ModbusLink {
         self.client.caller().perform(Event::Reset);
     }
 
+    fn last_frames(&self) -> Vec<String> {
+        self.client.frames().lines()
+    }
+
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         let mut wrong = String::new();
         for _ in 0..FOREIGN_LOOKS {

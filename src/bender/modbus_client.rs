@@ -20,6 +20,7 @@ use super::link::LinkError;
 use super::open::{Connection, Opener, open};
 use super::plan;
 use super::profile::Profile;
+use super::recording::Frames;
 use super::transport::Transport;
 
 /// How often a device that says "busy" is asked again.
@@ -34,6 +35,7 @@ pub struct ModbusClient {
     unit_id: u8,
     opener: Option<Opener>,
     caller: Caller<Connection>,
+    frames: Frames,
     /// When something was last heard.
     heard: Instant,
 }
@@ -50,7 +52,14 @@ impl ModbusClient {
         let silence_ms = profile.transport.line().map(|line| millis(line.quiet));
         let asking_ms = millis(profile.deadlines.request);
         let caller = Caller::new(endpoint, &profile.deadlines, asking_ms, silence_ms)?;
-        Ok(ModbusClient { profile, unit_id, opener, caller, heard: Instant::now() })
+        Ok(ModbusClient {
+            profile,
+            unit_id,
+            opener,
+            caller,
+            frames: Frames::default(),
+            heard: Instant::now(),
+        })
     }
 
     /// Opens the connection if need be, and lets a line be silent; until when a reply is waited for.
@@ -65,7 +74,8 @@ impl ModbusClient {
                 Next::Send(until) => return Ok(until),
                 Next::Open(until) => {
                     let endpoint = self.caller.endpoint().to_owned();
-                    let opening = open(&self.profile, self.unit_id, &endpoint, self.opener.as_mut());
+                    let opening =
+                        open(&self.profile, self.unit_id, &endpoint, self.opener.as_mut(), &self.frames);
                     self.caller.open(until, opening).await?;
                 }
             }
@@ -125,6 +135,11 @@ impl ModbusClient {
                 other => return other,
             }
         }
+    }
+
+    /// What went by last.
+    pub fn frames(&self) -> &Frames {
+        &self.frames
     }
 
     /// When it may be called, and what was seen.

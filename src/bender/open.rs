@@ -11,6 +11,7 @@ use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
 
 use super::line::{Line, Wire};
 use super::profile::Profile;
+use super::recording::{Frames, Recorded};
 use super::rs485;
 use super::transport::{Parity, SerialSettings};
 
@@ -31,25 +32,28 @@ pub async fn open(
     unit_id: u8,
     endpoint: &str,
     opener: Option<&mut Opener>,
+    frames: &Frames,
 ) -> io::Result<Connection> {
-    let wire = wire(profile, endpoint, opener).await?;
+    let wire = wire(profile, endpoint, opener, frames).await?;
     Ok(match profile.transport.line() {
         None => Connection::Stream(tcp::attach_slave(wire, Slave(unit_id))),
         Some(line) => Connection::Line(Line::new(wire, line.echo)),
     })
 }
 
-/// What a profile's transport leads over.
+/// What a profile's transport leads over; what goes over it is kept in `frames` for a while.
 pub async fn wire(
     profile: &Profile,
     endpoint: &str,
     opener: Option<&mut Opener>,
+    frames: &Frames,
 ) -> io::Result<Box<dyn Wire>> {
-    Ok(match (opener, profile.transport.serial()) {
+    let wire: Box<dyn Wire> = match (opener, profile.transport.serial()) {
         (Some(opener), _) => opener()?,
         (None, Some(settings)) => Box::new(serial_port(endpoint, settings)?),
         (None, None) => Box::new(socket(endpoint).await?),
-    })
+    };
+    Ok(Box::new(Recorded::new(wire, frames.clone())))
 }
 
 async fn socket(endpoint: &str) -> io::Result<TcpStream> {

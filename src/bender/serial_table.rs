@@ -10,6 +10,7 @@ use super::exchange::{Action, Ask, Event, Exchange, Failure, Protocol};
 use super::line_port::LinePort;
 use super::open::{Opener, wire};
 use super::profile::Profile;
+use super::recording::Frames;
 use super::serial_frame::{Decoder, Frame, MOST_PAYLOAD};
 
 /// How often one frame is sent again.
@@ -26,6 +27,7 @@ const BUSY: u8 = 3;
 pub struct SerialTable {
     profile: Profile,
     opener: Option<Opener>,
+    frames: Frames,
     unit: u8,
     sequence: u8,
     reply_ms: u64,
@@ -35,7 +37,14 @@ impl SerialTable {
     /// With the machine `unit` on the line; over wires that `opener` makes, where there is one.
     pub fn new(profile: &Profile, unit: u8, opener: Option<Opener>) -> SerialTable {
         let reply_ms = super::caller::millis(profile.deadlines.request);
-        SerialTable { profile: profile.clone(), opener, unit, sequence: 0, reply_ms }
+        SerialTable {
+            profile: profile.clone(),
+            opener,
+            frames: Frames::default(),
+            unit,
+            sequence: 0,
+            reply_ms,
+        }
     }
 
     /// A frame of the next number.
@@ -84,8 +93,12 @@ impl Protocol for SerialTable {
         })
     }
 
+    fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
     async fn open(&mut self, endpoint: &str) -> io::Result<LinePort> {
-        let wire = wire(&self.profile, endpoint, self.opener.as_mut()).await?;
+        let wire = wire(&self.profile, endpoint, self.opener.as_mut(), &self.frames).await?;
         let echo = self.profile.transport.line().is_some_and(|line| line.echo);
         Ok(LinePort::new(wire, echo))
     }

@@ -165,6 +165,10 @@ impl<P: Protocol> Bender for TableLink<P> {
         self.caller.perform(Happened::Reset);
     }
 
+    fn last_frames(&self) -> Vec<String> {
+        self.protocol.frames().lines()
+    }
+
     async fn read_status(&mut self) -> Result<Status, LinkError> {
         let mut wrong = String::new();
         for _ in 0..FOREIGN_LOOKS {

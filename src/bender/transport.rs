@@ -123,6 +123,16 @@ pub enum Device {
     Direct(DirectMap),
 }
 
+impl Device {
+    /// Unit identifier.
+    pub fn unit_id(&self) -> u8 {
+        match self {
+            Device::Staged(map) => map.unit_id,
+            Device::Direct(map) => map.unit_id,
+        }
+    }
+}
+
 /// A line: it cannot be closed, so what is still under way arrives.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LineSettings {

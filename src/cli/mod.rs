@@ -15,6 +15,7 @@ mod push;
 mod push_text;
 mod reconstruct;
 mod run;
+mod selftest;
 mod simulate;
 mod simulate_bender;
 
@@ -54,6 +55,8 @@ enum Command {
     Convert(convert::Args),
     /// Delivers one table to a bender by hand: stage, verify, commit.
     Push(push::Args),
+    /// Tries a profile at a real machine, step by step, and says what to change.
+    Selftest(selftest::Args),
 }
 
 /// Units in which scan files come.
@@ -124,6 +127,7 @@ pub fn main() -> ExitCode {
         Command::Correct(args) => correct::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Push(args) => push::run(&args),
+        Command::Selftest(args) => selftest::run(&args),
     };
     match result {
         Ok(_) if OUTPUT_LOST.load(Ordering::Relaxed) => ExitCode::from(2),

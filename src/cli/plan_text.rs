@@ -93,10 +93,10 @@ fn registers(request: &Request) -> String {
 
 fn transport(profile: &Profile) -> String {
     match &profile.transport {
-        Transport::ModbusTcp(device) => format!("Modbus TCP, unit {}", unit(device)),
-        Transport::ModbusRtuOverTcp(device, _) => format!("Modbus RTU over TCP, unit {}", unit(device)),
+        Transport::ModbusTcp(device) => format!("Modbus TCP, unit {}", device.unit_id()),
+        Transport::ModbusRtuOverTcp(device, _) => format!("Modbus RTU over TCP, unit {}", device.unit_id()),
         Transport::ModbusRtu(device, _, port) => {
-            format!("Modbus RTU, {}, unit {}", serial(port), unit(device))
+            format!("Modbus RTU, {}, unit {}", serial(port), device.unit_id())
         }
         Transport::Can(can) if can.fd => "CAN FD".into(),
         Transport::Can(_) => "CAN".into(),
@@ -105,13 +105,6 @@ fn transport(profile: &Profile) -> String {
         Transport::SerialTable(unit, _, port) => {
             format!("serial table protocol, {}, unit {unit}", serial(port))
         }
-    }
-}
-
-fn unit(device: &Device) -> u8 {
-    match device {
-        Device::Staged(map) => map.unit_id,
-        Device::Direct(map) => map.unit_id,
     }
 }
 

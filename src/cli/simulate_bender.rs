@@ -1,5 +1,7 @@
 //! `benderd simulate bender`: a bender on a socket or a serial line, until Ctrl-C or SIGTERM.
 
+use std::path::PathBuf;
+
 use anyhow::{Context as _, bail};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -8,7 +10,8 @@ use crate::bender::Profile;
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
 use crate::sim::door::Door;
-use crate::sim::faults::Fault;
+use crate::sim::faults::{Fault, WireFaults};
+use crate::sim::script;
 
 /// Arguments of `benderd simulate bender`.
 #[derive(Debug, clap::Args)]
@@ -30,6 +33,15 @@ pub struct Args {
     /// drop-before-apply, drop-after-apply, silent-after-commit, busy, frozen.
     #[arg(long)]
     fault: Option<Fault>,
+    /// What goes wrong and when: a TOML file as config/faults.toml.
+    #[arg(long, value_name = "FILE", conflicts_with = "seed")]
+    script: Option<PathBuf>,
+    /// Faults by chance that this number decides: answers lost, late, damaged, busy; power off and on.
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Of a thousand answers so many meet one.
+    #[arg(long, value_name = "P", default_value_t = 100, requires = "seed")]
+    per_mille: u32,
 }
 
 /// Runs the subcommand.
@@ -42,17 +54,22 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     if usize::from(args.bends) > profile.limits.max_bends {
         bail!("--bends {}: profile {} has room for {}", args.bends, profile.name, profile.limits.max_bends);
     }
+    let faults = match (&args.script, args.seed) {
+        (Some(file), _) => Some(WireFaults::events(script::load(file)?)),
+        (None, seed) => seed.map(|seed| WireFaults::by_chance(&profile, seed, args.per_mille)),
+    };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    runtime.block_on(serve(args, profile))
+    runtime.block_on(serve(args, profile, faults))
 }
 
-async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
+async fn serve(args: &Args, profile: Profile, faults: Option<WireFaults>) -> anyhow::Result<Outcome> {
     let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
     let (door, _kept) =
         Door::open(&profile, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
     let name = profile.name.clone();
     let model = MachineModel::new(profile, &args.program, args.bends);
     let bender = SimulatedBender::start(door, model, args.fault, |event| say(&describe(&event)))?;
+    bender.set_wire_faults(faults);
     say(&format!(
         "simulated bender {name} listens on {}; program {:?} with {} bends is loaded",
         bender.address(),
@@ -70,6 +87,7 @@ async fn serve(args: &Args, profile: Profile) -> anyhow::Result<Outcome> {
 
 fn describe(event: &MachineEvent) -> String {
     match event {
+        MachineEvent::Trouble(what) => format!("trouble at {what}"),
         MachineEvent::TakenOver { id, program, bends } => {
             format!("table taken over: {id}, program {program:?}, {bends} bends")
         }

@@ -4,8 +4,10 @@
 //! from the contract (protocols/reference-modbus.md), not from the delivery: the two check each other.
 //! `registers` shows it as Modbus registers, `bender_server` puts it on a socket.
 
-use crate::bender::{Profile, Staged, TableId, check_limits, crc_of, decode_payload, payload_bytes};
-use crate::tube::CommandTable;
+use crate::bender::{
+    Profile, Staged, TableId, check_limits, crc_of, decode_payload, encode_payload, payload_bytes,
+};
+use crate::tube::{CommandRow, CommandTable};
 
 /// What happened in a program cycle.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -26,6 +28,8 @@ pub enum MachineEvent {
         /// Code of the wire contract.
         code: u16,
     },
+    /// Something went wrong, as was asked for: when, and what.
+    Trouble(String),
 }
 
 /// The machine.
@@ -48,6 +52,8 @@ pub struct MachineModel {
     pub corrupts_staging: bool,
     /// The controller's program stands still: no heartbeat, no commit dealt with.
     pub frozen: bool,
+    /// The payload that the operator enters at the screen; none: one that this machine can make.
+    pub at_screen: Option<Vec<u8>>,
 }
 
 impl MachineModel {
@@ -69,6 +75,7 @@ impl MachineModel {
             staging,
             corrupts_staging: false,
             frozen: false,
+            at_screen: None,
         }
     }
 
@@ -89,9 +96,19 @@ impl MachineModel {
 
     /// A part starts or ends: the state bit "between parts" (the first bit where the profile has none so named).
     pub fn set_between_parts(&mut self, between: bool) {
+        self.set_condition("between parts", between);
+    }
+
+    /// Emergency stop: the state bit of this name (the first bit where the profile has none so named).
+    pub fn emergency_stop(&mut self) {
+        self.set_condition("emergency stop", false);
+    }
+
+    /// Whether the condition of a state bit holds from now on.
+    fn set_condition(&mut self, name: &str, holds: bool) {
         let bits = &self.profile.state_bits;
-        let Some(bit) = bits.iter().find(|b| b.name == "between parts").or(bits.first()) else { return };
-        let (mask, on) = (1 << bit.bit, between == bit.must_be);
+        let Some(bit) = bits.iter().find(|b| b.name == name).or(bits.first()) else { return };
+        let (mask, on) = (1 << bit.bit, holds == bit.must_be);
         self.state = if on { self.state | mask } else { self.state & !mask };
     }
 
@@ -191,6 +208,18 @@ impl MachineModel {
         self.active_payload = payload;
     }
 
+    /// The operator enters a table at the screen.
+    pub fn operator_edits(&mut self) {
+        let payload = self.at_screen.clone().or_else(|| {
+            let bend = CommandRow { length_mm: 100.0, rotation_rad: 0.0, angle_rad: 1.0 };
+            let table = CommandTable { bends: vec![bend; self.bend_count.into()], last_length_mm: 100.0 };
+            encode_payload(&self.profile, &self.program, &table).ok()
+        });
+        if let Some(payload) = payload {
+            self.edit_at_screen(payload);
+        }
+    }
+
     /// The staged table, if it may be taken over; else the code of the refusal.
     fn examine(&self, id: TableId) -> Result<Staged, u16> {
         if self.staged_id() != id {
@@ -259,8 +288,7 @@ impl MachineModel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bender::{encode_payload, staging_image};
-    use crate::tube::CommandRow;
+    use crate::bender::staging_image;
 
     fn machine() -> MachineModel {
         MachineModel::new(Profile::load("reference-modbus").unwrap(), "P1", 2)

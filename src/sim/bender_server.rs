@@ -7,11 +7,12 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::task::{JoinHandle, JoinSet};
+use tokio::time::Instant;
 
 use super::bender::{MachineEvent, MachineModel};
 use super::can_station::CanStation;
 use super::door::{Door, Speech};
-use super::faults::{Fault, WireFaults};
+use super::faults::{Fault, When, WireFaults};
 use super::folder_station::FolderStation;
 use super::frames::Framing;
 use super::modbus_station::ModbusStation;
@@ -48,16 +49,23 @@ impl SimulatedBender {
             fault,
             mute: Mutex::new(false),
             wire_faults: Mutex::new(None),
+            happened: Mutex::new(Vec::new()),
         });
         let ticking = Arc::clone(&shared);
         let cycle = tokio::spawn(async move {
-            let mut interval = tokio::time::interval(CYCLE);
+            let (mut interval, begun) = (tokio::time::interval(CYCLE), Instant::now());
             loop {
                 interval.tick().await;
                 let event = lock(&ticking.model).tick();
-                if let Some(event) = event {
-                    on_event(event);
+                if matches!(event, Some(MachineEvent::TakenOver { .. })) {
+                    ticking.pass(When::TakenOver);
                 }
+                ticking.pass(When::Ms(begun.elapsed().as_millis() as u64));
+                let happened = std::mem::take(&mut *lock(&ticking.happened));
+                event
+                    .into_iter()
+                    .chain(happened.into_iter().map(MachineEvent::Trouble))
+                    .for_each(&mut on_event);
             }
         });
         let serving = tokio::spawn(serve_door(door, Arc::clone(&shared)));
@@ -69,7 +77,7 @@ impl SimulatedBender {
         &self.address
     }
 
-    /// What happens to its answers on the wire from now on.
+    /// What happens to it and to its answers on the wire from now on.
     pub fn set_wire_faults(&self, faults: Option<WireFaults>) {
         *lock(&self.shared.wire_faults) = faults;
     }

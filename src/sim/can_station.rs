@@ -190,7 +190,7 @@ mod tests {
 
     fn say(model: &mut MachineModel, fault: Option<Fault>, id: u16, data: &[u8]) -> Vec<String> {
         let mut mute = false;
-        let mut controller = Controller { model, fault, mute: &mut mute, hangs_up: false };
+        let mut controller = Controller::new(model, fault, &mut mute);
         let answers = CanStation::new().hear(send(id, data), &mut controller);
         answers.iter().map(Frame::to_string).collect()
     }
@@ -202,12 +202,7 @@ mod tests {
         let mut sent = Vec::new();
         for _ in 0..10 {
             m.tick();
-            sent = station.cycle(&mut Controller {
-                model: &mut m,
-                fault: None,
-                mute: &mut mute,
-                hangs_up: false,
-            });
+            sent = station.cycle(&mut Controller::new(&mut m, None, &mut mute));
         }
         let sent: Vec<String> = sent.iter().map(Frame::to_string).collect();
         // Cycle 1, layout 1, heartbeat 10, automatic and between parts, 3 bends; "BEND"; the program's first four characters.

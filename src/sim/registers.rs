@@ -27,11 +27,7 @@ impl MachineModel {
 
     /// The unit that it answers for.
     pub fn unit_id(&self) -> u8 {
-        match self.profile.transport.device() {
-            Some(Device::Staged(map)) => map.unit_id,
-            Some(Device::Direct(map)) => map.unit_id,
-            None => 0,
-        }
+        self.profile.transport.device().map_or(0, Device::unit_id)
     }
 
     /// Where a commit is written.

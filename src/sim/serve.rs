@@ -1,5 +1,6 @@
 //! Puts a station on a port: what arrives is heard, what it answers goes out, with the faults of the wire.
 
+use std::future::Future;
 use std::io;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -7,9 +8,10 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 
 use super::bender::MachineModel;
-use super::faults::{Damaged, Fault, ReplyFault, WireFaults};
+use super::faults::{Damaged, Fault, ReplyFault, Trouble, When, WireFaults};
 use super::station::{Controller, Station};
-use crate::bender::Port;
+use crate::bender::can::CanPort;
+use crate::bender::{FolderPort, Port};
 
 /// Cycle of the simulated controller's program.
 pub const CYCLE: Duration = Duration::from_millis(10);
@@ -28,11 +30,31 @@ pub struct Shared {
     pub mute: Mutex<bool>,
     /// What happens to answers on the wire.
     pub wire_faults: Mutex<Option<WireFaults>>,
+    /// What of that has happened, and was not told yet.
+    pub happened: Mutex<Vec<String>>,
 }
 
 /// A panic elsewhere leaves the machine as it is; it keeps answering, as a real one would.
 pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A port at the machine's end.
+pub trait MachinePort: Port {
+    /// Closes the writing side; nothing where there is none.
+    fn half_close(&mut self) -> impl Future<Output = io::Result<()>> + Send {
+        std::future::ready(Ok(()))
+    }
+}
+
+impl MachinePort for FolderPort {}
+
+impl MachinePort for CanPort {}
+
+impl<W: AsyncRead + AsyncWrite + Unpin + Send> MachinePort for WirePort<W> {
+    async fn half_close(&mut self) -> io::Result<()> {
+        self.0.shutdown().await
+    }
 }
 
 /// A wire of bytes.
@@ -62,7 +84,7 @@ impl<W: AsyncRead + AsyncWrite + Unpin + Send> Port for WirePort<W> {
 /// Until the port is closed or the machine hangs up.
 pub async fn serve<P, S>(mut port: P, mut station: S, shared: &Shared)
 where
-    P: Port,
+    P: MachinePort,
     P::Piece: Damaged,
     S: Station<Piece = P::Piece>,
 {
@@ -99,16 +121,42 @@ where
 impl Shared {
     /// Lets a station act; and whether the machine hangs up.
     fn attend<T>(&self, act: impl FnOnce(&mut Controller<'_>) -> T) -> (T, bool) {
-        let (mut model, mut mute) = (lock(&self.model), lock(&self.mute));
-        let mut controller =
-            Controller { model: &mut model, fault: self.fault, mute: &mut mute, hangs_up: false };
-        let result = act(&mut controller);
-        (result, controller.hangs_up)
+        let busy = lock(&self.wire_faults).as_mut().is_some_and(WireFaults::is_busy);
+        let (result, hangs_up, committed) = {
+            let (mut model, mut mute) = (lock(&self.model), lock(&self.mute));
+            let mut controller = Controller {
+                model: &mut model,
+                fault: self.fault,
+                mute: &mut mute,
+                busy,
+                committed: false,
+                hangs_up: false,
+            };
+            let result = act(&mut controller);
+            (result, controller.hangs_up, controller.committed)
+        };
+        if committed {
+            self.pass(When::Commit);
+        }
+        (result, hangs_up)
+    }
+
+    /// What is due now happens at the machine.
+    pub fn pass(&self, now: When) {
+        let due = lock(&self.wire_faults).as_mut().map(|faults| faults.due(now)).unwrap_or_default();
+        for (when, trouble) in due {
+            self.strike(when, trouble);
+        }
+    }
+
+    fn strike(&self, when: When, trouble: Trouble) {
+        trouble.strike(&mut lock(&self.model));
+        lock(&self.happened).push(format!("{when}: {trouble}"));
     }
 
     async fn answer<P>(&self, port: &mut P, answers: Vec<P::Piece>) -> io::Result<()>
     where
-        P: Port,
+        P: MachinePort,
         P::Piece: Damaged,
     {
         for answer in answers {
@@ -123,29 +171,37 @@ impl Shared {
     /// Sends what arrives of a piece, when it does.
     async fn damaged<P>(&self, port: &mut P, piece: P::Piece, takes_time: bool) -> io::Result<()>
     where
-        P: Port,
+        P: MachinePort,
         P::Piece: Damaged,
     {
-        let (arriving, ms) = {
-            let mut faults = lock(&self.wire_faults);
-            match faults.as_mut() {
-                None => (vec![piece], 0),
-                Some(faults) => {
-                    let usual_ms = if takes_time { faults.usual_ms() } else { 0 };
-                    match faults.fault() {
-                        None => (vec![piece], usual_ms),
-                        Some(ReplyFault::Late { ms }) => (vec![piece], usual_ms + ms),
-                        Some(fault) => (piece.damaged(fault, faults), usual_ms),
-                    }
-                }
-            }
-        };
+        let (arriving, ms, trouble) = self.meet(piece, takes_time);
         if ms > 0 {
             tokio::time::sleep(Duration::from_millis(ms)).await;
+        }
+        if trouble == Some(Trouble::HalfClose) {
+            port.half_close().await?;
         }
         for piece in arriving {
             port.send(piece).await?;
         }
         Ok(())
+    }
+
+    /// What arrives of an answer, how much later, and what it met.
+    fn meet<P: Damaged>(&self, piece: P, takes_time: bool) -> (Vec<P>, u64, Option<Trouble>) {
+        let mut guard = lock(&self.wire_faults);
+        let Some(faults) = guard.as_mut() else { return (vec![piece], 0, None) };
+        let usual_ms = if takes_time { faults.usual_ms() } else { 0 };
+        let (number, Some(trouble)) = faults.answer() else { return (vec![piece], usual_ms, None) };
+        let (arriving, late_ms) = match trouble {
+            Trouble::Reply(ReplyFault::Late { ms }) => (vec![piece], ms),
+            Trouble::Reply(fault) => (piece.damaged(fault, faults), 0),
+            Trouble::Cut { bytes } | Trouble::EmergencyStop { bytes } => (piece.cut(bytes), 0),
+            Trouble::HalfClose | Trouble::Reboot => (Vec::new(), 0),
+            _ => (vec![piece], 0),
+        };
+        drop(guard);
+        self.strike(When::Answer(number), trouble);
+        (arriving, usual_ms + late_ms, Some(trouble))
     }
 }

@@ -29,14 +29,23 @@ pub struct Controller<'a> {
     pub fault: Option<Fault>,
     /// Answers nothing any more.
     pub mute: &'a mut bool,
+    /// Has no time, this once.
+    pub busy: bool,
+    /// A commit was written.
+    pub committed: bool,
     /// The connection is to be cut.
     pub hangs_up: bool,
 }
 
-impl Controller<'_> {
+impl<'a> Controller<'a> {
+    /// Of a machine that has not been told to do anything yet.
+    pub fn new(model: &'a mut MachineModel, fault: Option<Fault>, mute: &'a mut bool) -> Controller<'a> {
+        Controller { model, fault, mute, hangs_up: false, busy: false, committed: false }
+    }
+
     /// Whether it has no time.
     pub fn is_busy(&self) -> bool {
-        self.fault == Some(Fault::Busy)
+        self.busy || self.fault == Some(Fault::Busy)
     }
 
     /// Whether it hears nothing.
@@ -52,6 +61,7 @@ impl Controller<'_> {
         }
         if self.fault != Some(Fault::DropBeforeApply) {
             self.model.write_commit(id);
+            self.committed = true;
         }
         !self.hangs_up && !*self.mute
     }

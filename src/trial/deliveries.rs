@@ -4,7 +4,6 @@
 //! Under tokio's paused clock ten thousand of them take seconds; over a real line, as long as they take.
 
 use std::collections::BTreeMap;
-use std::convert::Infallible;
 use std::fmt;
 use std::path::Path;
 use std::time::Duration;
@@ -22,7 +21,7 @@ use crate::bender::{
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
 use crate::sim::door::{Door, Speech};
-use crate::sim::faults::WireFaults;
+use crate::sim::faults::{Trouble, When, WireFaults};
 use crate::sim::pty::Kept;
 use crate::tube::{CommandRow, CommandTable};
 
@@ -35,9 +34,14 @@ const BUS_PATIENCE: Duration = Duration::from_secs(1);
 /// The program that the machine has loaded.
 const PROGRAM: &str = "P1";
 
-/// Trouble at the machine comes within this time of the delivery's begin, in one of so many deliveries.
+/// Trouble at the machine comes within this time of the delivery's begin, or so many answers, or at the commit; in one of so many
+/// deliveries.
 const TROUBLE_WITHIN_MS: u64 = 400;
+const TROUBLE_WITHIN_ANSWERS: u64 = 15;
 const TROUBLE_ONE_IN: u32 = 4;
+
+/// An emergency stop cuts an answer off before this byte.
+const MOST_BYTES: usize = 260;
 
 /// The longest that is waited for a machine to come back, in looks of one second.
 const LOOKS: usize = 90;
@@ -171,33 +175,23 @@ pub async fn run(
 
     let mut model = MachineModel::new(profile.clone(), PROGRAM, bends as u16);
     model.edit_at_screen(old.clone());
+    model.at_screen = Some(edited.clone());
     let (tell, told) = std::sync::mpsc::channel();
     let bender = SimulatedBender::start(ends.door, model, None, move |event| drop(tell.send(event)))?;
-    let quiet = profile.transport.line().map_or(profile.deadlines.request, |line| line.quiet);
-    let latest_ms = quiet.as_millis() as u64;
-    bender.set_wire_faults(Some(WireFaults::new(seed, per_mille, latest_ms)));
-    let trouble = trouble(&mut rng);
+    let mut faults = WireFaults::by_chance(profile, seed, per_mille);
+    if let Some((when, trouble)) = trouble(&mut rng) {
+        faults = faults.and(when, trouble);
+    }
+    bender.set_wire_faults(Some(faults));
 
     let (mut link, mut log) = (ends.link, Memory::default());
-    let outcome = {
-        let delivery = deliver(&mut link, &job, &mut log);
-        let after = Duration::from_millis(rng.random_range(0..TROUBLE_WITHIN_MS));
-        let machine = async {
-            tokio::time::sleep(after).await;
-            bender.with(|m| trouble(m, &edited));
-            std::future::pending::<Infallible>().await
-        };
-        tokio::select! {
-            outcome = delivery => outcome,
-            never = machine => match never {},
-        }
-    };
+    let outcome = deliver(&mut link, &job, &mut log).await;
     bender.set_wire_faults(None);
     bender.with(|m| m.frozen = false);
     // What was still under way has arrived, and the machine has dealt with it.
     tokio::time::sleep(Duration::from_millis(profile.deadlines.settle_ms)).await;
     let active = bender.with(|m| (m.active(), m.active_payload()));
-    let events = told.try_iter().collect();
+    let events = told.try_iter().filter(|event| !matches!(event, MachineEvent::Trouble(_))).collect();
     let found = Found { outcome, active, events, intents: log.intents, old, new, edited };
     Ok(match found.check() {
         Err(what) => Err(what),
@@ -273,20 +267,27 @@ pub fn table(rng: &mut ChaCha8Rng, bends: usize) -> CommandTable {
     CommandTable { bends: (0..bends).map(|_| row()).collect(), last_length_mm: 50.0 }
 }
 
-type Trouble = fn(&mut MachineModel, &[u8]);
-
-/// What happens at the machine meanwhile: mostly nothing.
-fn trouble(rng: &mut ChaCha8Rng) -> Trouble {
+/// What happens at the machine meanwhile, and when: mostly nothing.
+fn trouble(rng: &mut ChaCha8Rng) -> Option<(When, Trouble)> {
     if rng.random_range(0..TROUBLE_ONE_IN) > 0 {
-        return |_, _| ();
+        return None;
     }
-    match rng.random_range(0..5) {
-        0 => |m, _| m.power_cycle(),
-        1 => |m, edited| m.edit_at_screen(edited.to_vec()),
-        2 => |m, _| m.set_between_parts(false),
-        3 => |m, _| m.frozen = true,
-        _ => |m, _| m.rename_program("P2"),
-    }
+    let trouble = match rng.random_range(0..7) {
+        0 => Trouble::Reboot,
+        1 => Trouble::Edit,
+        2 => Trouble::Running,
+        3 => Trouble::Frozen,
+        4 => Trouble::OtherProgram,
+        5 => Trouble::EmergencyStop { bytes: rng.random_range(0..MOST_BYTES) },
+        _ => Trouble::HalfClose,
+    };
+    let when = match rng.random_range(0..4) {
+        0 => When::Ms(rng.random_range(0..TROUBLE_WITHIN_MS)),
+        1 => When::Answer(rng.random_range(1..=TROUBLE_WITHIN_ANSWERS)),
+        2 => When::Commit,
+        _ => When::TakenOver,
+    };
+    Some((when, trouble))
 }
 
 /// Keeps what a journal would keep.

@@ -13,6 +13,8 @@ use super::frame::{Condition, Frame, Heard, Storm};
 use super::socket::Socket;
 use crate::bender::caller::millis;
 use crate::bender::exchange::Port;
+use crate::bender::recording::Frames;
+use crate::bender::ring::{Content, Direction};
 
 /// After so long a frame that found no room is tried again; a frame takes about a quarter of it on a bus of 500 kbit/s.
 const ROOM_AGAIN: Duration = Duration::from_millis(1);
@@ -45,6 +47,7 @@ pub struct CanPort {
     patience: Duration,
     storm: Storm,
     since: Instant,
+    frames: Frames,
 }
 
 /// Opens a port on the interface `endpoint`, or where `opener` says. With `fd` the interface must carry CAN FD.
@@ -65,7 +68,12 @@ impl CanPort {
     /// A port; `patience` is the longest that a frame waits for room.
     pub fn new(bus: Box<dyn Bus>, interface: &str, patience: Duration) -> CanPort {
         let (storm, since) = (Storm::default(), Instant::now());
-        CanPort { bus, interface: interface.to_owned(), patience, storm, since }
+        CanPort { bus, interface: interface.to_owned(), patience, storm, since, frames: Frames::default() }
+    }
+
+    /// What goes by is kept in `frames` for a while.
+    pub fn recorded(self, frames: Frames) -> CanPort {
+        CanPort { frames, ..self }
     }
 
     /// What a condition means for who uses the port.
@@ -130,6 +138,7 @@ impl Port for CanPort {
 
     async fn send(&mut self, piece: Frame) -> io::Result<()> {
         let until = Instant::now() + self.patience;
+        self.frames.add(Direction::Sent, Content::Text(piece.to_string()));
         loop {
             match poll_fn(|cx| self.bus.poll_send(cx, &piece)).await {
                 Err(error) if has_no_room(&error) && Instant::now() < until => sleep(ROOM_AGAIN).await,
@@ -150,7 +159,10 @@ impl Port for CanPort {
     async fn receive(&mut self) -> io::Result<Frame> {
         loop {
             match poll_fn(|cx| self.bus.poll_receive(cx)).await? {
-                Heard::Frame(frame) => return Ok(frame),
+                Heard::Frame(frame) => {
+                    self.frames.add(Direction::Received, Content::Text(frame.to_string()));
+                    return Ok(frame);
+                }
                 Heard::Condition(condition) => self.weigh(condition)?,
             }
         }

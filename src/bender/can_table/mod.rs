@@ -17,6 +17,7 @@ use super::caller::millis;
 use super::can::{BusOpener, CanPort, Frame, open_port};
 use super::exchange::{Ask, Exchange, Protocol};
 use super::profile::Profile;
+use super::recording::Frames;
 use commit::Commit;
 pub use contract::{Contract, PROGRAM_BYTES, ROWS};
 use status::Listening;
@@ -36,12 +37,13 @@ pub struct CanTable {
     profile: Profile,
     settings: CanSettings,
     opener: Option<BusOpener>,
+    frames: Frames,
 }
 
 impl CanTable {
     /// For a machine of this profile, on an interface or where `opener` says.
     pub fn new(profile: &Profile, settings: &CanSettings, opener: Option<BusOpener>) -> CanTable {
-        CanTable { profile: profile.clone(), settings: settings.clone(), opener }
+        CanTable { profile: profile.clone(), settings: settings.clone(), opener, frames: Frames::default() }
     }
 }
 
@@ -60,7 +62,13 @@ impl Protocol for CanTable {
         }
     }
 
+    fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
     async fn open(&mut self, endpoint: &str) -> io::Result<CanPort> {
-        open_port(endpoint, self.opener.as_mut(), self.settings.fd, self.profile.deadlines.request)
+        let port =
+            open_port(endpoint, self.opener.as_mut(), self.settings.fd, self.profile.deadlines.request)?;
+        Ok(port.recorded(self.frames.clone()))
     }
 }

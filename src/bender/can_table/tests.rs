@@ -75,12 +75,7 @@ impl Shop {
             for piece in pieces {
                 self.sent.push(piece.clone());
                 for _ in 0..self.arrives() {
-                    let mut controller = Controller {
-                        model: &mut self.model,
-                        fault: self.fault,
-                        mute: &mut mute,
-                        hangs_up: false,
-                    };
+                    let mut controller = Controller::new(&mut self.model, self.fault, &mut mute);
                     waiting.extend(self.station.hear(piece.clone(), &mut controller));
                 }
             }
@@ -98,12 +93,7 @@ impl Shop {
                 }
                 self.now_ms += 10;
                 self.model.tick();
-                let mut controller = Controller {
-                    model: &mut self.model,
-                    fault: self.fault,
-                    mute: &mut mute,
-                    hangs_up: false,
-                };
+                let mut controller = Controller::new(&mut self.model, self.fault, &mut mute);
                 waiting.extend(self.station.cycle(&mut controller));
             };
         }
@@ -141,8 +131,8 @@ fn a_status_is_of_one_cycle() {
     listening.on(Event::Begun, 0);
     let mut cycles: Vec<Vec<Frame>> = Vec::new();
     while cycles.len() < 3 {
-        let mut controller =
-            Controller { model: &mut shop.model, fault: None, mute: &mut false, hangs_up: false };
+        let mut mute = false;
+        let mut controller = Controller::new(&mut shop.model, None, &mut mute);
         cycles.push(shop.station.cycle(&mut controller));
         cycles.retain(|cycle| !cycle.is_empty());
     }

@@ -16,6 +16,7 @@ use super::caller::millis;
 use super::can::{BusOpener, CanPort, Frame, FrameId, open_port};
 use super::exchange::{Ask, Exchange, Protocol};
 use super::profile::Profile;
+use super::recording::Frames;
 use super::wire::{commit_image, payload_bytes};
 use dialogue::{Client, Finish};
 use download::Download;
@@ -76,12 +77,13 @@ pub struct Canopen {
     profile: Profile,
     settings: CanopenSettings,
     opener: Option<BusOpener>,
+    frames: Frames,
 }
 
 impl Canopen {
     /// For a machine of this profile, on an interface or where `opener` says.
     pub fn new(profile: &Profile, settings: &CanopenSettings, opener: Option<BusOpener>) -> Canopen {
-        Canopen { profile: profile.clone(), settings: settings.clone(), opener }
+        Canopen { profile: profile.clone(), settings: settings.clone(), opener, frames: Frames::default() }
     }
 
     fn upload(&self, object: Object, finish: Finish) -> Box<dyn Exchange<Piece = Frame>> {
@@ -138,7 +140,12 @@ impl Protocol for Canopen {
         }
     }
 
+    fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
     async fn open(&mut self, endpoint: &str) -> io::Result<CanPort> {
-        open_port(endpoint, self.opener.as_mut(), false, self.profile.deadlines.request)
+        let port = open_port(endpoint, self.opener.as_mut(), false, self.profile.deadlines.request)?;
+        Ok(port.recorded(self.frames.clone()))
     }
 }

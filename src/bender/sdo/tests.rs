@@ -234,12 +234,7 @@ impl Shop {
             let mut mute = false;
             for piece in pieces {
                 if self.arrives() {
-                    let mut controller = Controller {
-                        model: &mut self.model,
-                        fault: self.fault,
-                        mute: &mut mute,
-                        hangs_up: false,
-                    };
+                    let mut controller = Controller::new(&mut self.model, self.fault, &mut mute);
                     waiting.extend(self.server.hear(piece, &mut controller));
                 }
             }
@@ -252,12 +247,7 @@ impl Shop {
                     break Event::Timeout;
                 } else {
                     self.now_ms += 10;
-                    let mut controller = Controller {
-                        model: &mut self.model,
-                        fault: self.fault,
-                        mute: &mut mute,
-                        hangs_up: false,
-                    };
+                    let mut controller = Controller::new(&mut self.model, self.fault, &mut mute);
                     waiting.extend(self.server.cycle(&mut controller));
                 }
             };
@@ -353,7 +343,7 @@ proptest! {
         let mut shop = Shop::new(1, 0, true);
         let mut mute = false;
         for request in requests {
-            let mut controller = Controller { model: &mut shop.model, fault: None, mute: &mut mute, hangs_up: false };
+            let mut controller = Controller::new(&mut shop.model, None, &mut mute);
             shop.server.hear(Frame::new(FrameId::Standard(0x605), request), &mut controller);
             shop.server.cycle(&mut controller);
         }
