@@ -240,6 +240,21 @@ fn hard_choices_that_once_went_wrong() {
     expect_right(Set::Hard, &[87127, 88122]);
 }
 
+/// Points of the end's face that passed for a bend before it (89191), a centre line that went on from the end to a jaw (90161), jaws
+/// where a thin tube's large drift passed for two more passes (91026), and a pass whose last points lie where nothing tells how it
+/// moved, given to the next one (91216).
+#[test]
+fn ends_and_passes_that_once_misled() {
+    expect_right(Set::Hard, &[89191, 90161, 91026, 91216]);
+}
+
+/// Flat walls that had bends of their own and so were never seen (91052, 91099), a search that began again and found less than the one
+/// before (89050, 91054), one that lost what only beginning again finds (91023), and one that ran to and fro (89035).
+#[test]
+fn flat_walls_that_once_misled() {
+    expect_right(Set::Flattened, &[89035, 89050, 91023, 91052, 91054, 91099]);
+}
+
 /// A patch that was not scanned and a jaw hide the end of a bend; 4 and 7 mm before that passed for the straight behind it.
 #[test]
 fn a_bend_whose_end_is_hidden_is_refused() {

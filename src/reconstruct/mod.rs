@@ -150,7 +150,7 @@ pub fn reconstruct_watched(
 }
 
 /// The structure by `guide`, or freely, and notes on it. Flattened outer walls look like other bends: where there are some the
-/// structure is searched again with them known.
+/// structure is searched again with them known, from the polygon and from what was found.
 fn choose(shown: &mut Shown, guide: Option<&Nominal>) -> Option<(Structure, Vec<String>)> {
     let once = |shown: &Shown| match guide {
         Some(nominal) => guided::choose(shown, nominal),
@@ -160,6 +160,7 @@ fn choose(shown: &mut Shown, guide: Option<&Nominal>) -> Option<(Structure, Vec<
     for _ in 0..FLATTENINGS {
         let Some(walls) = flattening::walls(shown.sample, &found.0) else { break };
         shown.flattening = Flattening::Known(walls);
+        shown.before = Some(found.0.model);
         found = once(shown)?;
     }
     Some(found)
@@ -194,7 +195,7 @@ fn by(
         (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
     if let Some(again) = &again {
         let flattening = Flattening::NONE;
-        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, ..shown };
+        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, before: None, ..shown };
         (chosen, notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
         let what = format!("{} passes of the scan moved onto each other", passes.len());
         chosen.decisions.push(Decision { what, bend: None, gain, kept: true });

@@ -41,6 +41,9 @@ const FINER: usize = 12;
 const LEVELS: usize = 5;
 const FEW_POINTS: usize = 2;
 
+/// How far about a boundary the scan's jumps are looked for, in halves of a chunk of the first cut.
+const JUMP_REACHES: [usize; 3] = [4, 2, 1];
+
 /// So much less may a boundary explain where the scan jumps than where it explains the most.
 const MUCH: f64 = 50.0;
 
@@ -166,25 +169,51 @@ impl Asked<'_> {
             found = cut::needed(&blocks, cut::settled(&blocks, found, FINER), FINER, price);
         }
         let likeliest: Vec<u32> = found.iter().map(|&b| chunks[b].from).collect();
-        let jumps: Vec<u32> = likeliest.iter().map(|&b| self.jump_near(b)).collect();
-        let (ends, gain, motions) = self.at_jumps(likeliest, &jumps)?;
-        let ends = ends.into_iter().chain([u32::MAX]);
-        let pass = |(k, end): (usize, u32)| ScanPass { end, motion: self.motion(&motions, k) };
-        Some((ends.enumerate().map(pass).collect(), gain))
+        let jumps: Vec<Vec<u32>> = likeliest.iter().map(|&b| self.jumps_near(b)).collect();
+        let (boundaries, motions) = self.at_jumps(likeliest, &jumps)?;
+        self.confirmed(&boundaries, &motions, price)
     }
 
-    /// Index of the point, of those about an index, that is the farthest from the one before it: there the next pass began.
-    fn jump_near(&self, index: u32) -> u32 {
-        let near = self.whole.around(index, self.whole.len() / (2 * CHUNKS));
-        let places: Vec<Point3<f64>> = near.iter().map(|&i| self.whole.point(i)).collect();
-        let jumps = places.windows(2).map(|w| (w[1] - w[0]).norm_squared()).zip(&near[1..]);
-        jumps.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(index, |(_, i)| *i)
+    /// The passes between boundaries with their motions.
+    fn scan_passes(&self, boundaries: &[u32], motions: &DVector<f64>) -> Vec<ScanPass> {
+        let ends = boundaries.iter().copied().chain([u32::MAX]);
+        ends.enumerate().map(|(k, end)| ScanPass { end, motion: self.motion(motions, k) }).collect()
     }
 
-    /// Each boundary at the jump near it, unless much speaks against that: the last points of a pass may lie where nothing tells
-    /// how it moved. With the gain and the motions then.
-    fn at_jumps(&self, likeliest: Vec<u32>, jumps: &[u32]) -> Option<(Vec<u32>, f64, DVector<f64>)> {
-        let mut cuts: Vec<u32> = likeliest.iter().chain(jumps).copied().chain([0]).collect();
+    /// The passes without those that are not needed once all are moved, each as its points ask for from there: what a linear step
+    /// leaves of a large motion of a thin tube passes for more passes.
+    fn confirmed(
+        &self,
+        boundaries: &[u32],
+        motions: &DVector<f64>,
+        price: f64,
+    ) -> Option<(Vec<ScanPass>, f64)> {
+        let mut chunks: Vec<Chunk> = [0].iter().chain(boundaries).map(|&from| Chunk::from(from)).collect();
+        let moved = self.scan_passes(boundaries, motions);
+        self.sum_up_moved(&mut chunks, &self.whole.runs(RUN, MOST_POINTS), &moved);
+        let blocks = self.unsummed(&chunks).about(motions).summed();
+        let found = cut::needed(&blocks, (1..chunks.len()).collect(), 0, price);
+        let (gain, motions) = blocks.gain(&found)?;
+        let needed: Vec<u32> = found.into_iter().map(|b| chunks[b].from).collect();
+        Some((self.scan_passes(&needed, &motions), gain))
+    }
+
+    /// Indices of the points that are the farthest from the one before them of those about an index, the widest surroundings first:
+    /// where the next pass may have begun.
+    fn jumps_near(&self, index: u32) -> Vec<u32> {
+        let farthest = |reach: &usize| {
+            let near = self.whole.around(index, reach * self.whole.len() / (2 * CHUNKS));
+            let places: Vec<Point3<f64>> = near.iter().map(|&i| self.whole.point(i)).collect();
+            let jumps = places.windows(2).map(|w| (w[1] - w[0]).norm_squared()).zip(&near[1..]);
+            jumps.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(index, |(_, i)| *i)
+        };
+        JUMP_REACHES.iter().map(farthest).collect()
+    }
+
+    /// Each boundary at the widest jump near it that not much speaks against: the last points of a pass may lie where nothing tells
+    /// how it moved. With the motions then.
+    fn at_jumps(&self, likeliest: Vec<u32>, jumps: &[Vec<u32>]) -> Option<(Vec<u32>, DVector<f64>)> {
+        let mut cuts: Vec<u32> = likeliest.iter().chain(jumps.iter().flatten()).copied().chain([0]).collect();
         cuts.sort_unstable();
         cuts.dedup();
         let place = |index: &u32| cuts.binary_search(index).unwrap_or(0);
@@ -193,17 +222,20 @@ impl Asked<'_> {
         let blocks = self.blocks(&chunks);
         let mut found: Vec<usize> = likeliest.iter().map(place).collect();
         let (mut gain, mut motions) = blocks.gain(&found)?;
-        for (k, jump) in jumps.iter().enumerate() {
-            let mut other = found.clone();
-            other[k] = place(jump);
-            let is_order = other.windows(2).all(|w| w[0] < w[1]) && other[0] > 0;
-            let at_jump = blocks.gain(&other).filter(|g| is_order && g.0 > gain - MUCH);
-            if let Some(at_jump) = at_jump {
+        for (k, jumps) in jumps.iter().enumerate() {
+            let at = |jump: &u32| {
+                let mut other = found.clone();
+                other[k] = place(jump);
+                let is_order = other.windows(2).all(|w| w[0] < w[1]) && other[0] > 0;
+                let at_jump = blocks.gain(&other).filter(|g| is_order && g.0 > gain - MUCH);
+                at_jump.map(|g| (other, g))
+            };
+            if let Some((other, at_jump)) = jumps.iter().find_map(at) {
                 found = other;
                 (gain, motions) = at_jump;
             }
         }
-        Some((found.into_iter().map(|b| cuts[b]).collect(), gain, motions))
+        Some((found.into_iter().map(|b| cuts[b]).collect(), motions))
     }
 
     /// The chunks beside boundaries cut finer, the others between boundaries as one; and where the boundaries are among them.
@@ -264,8 +296,13 @@ impl Asked<'_> {
     /// Sums points of the file, in its order, into the chunks that they are of.
     fn sum_up(&self, chunks: &mut [Chunk], order: &[u32]) {
         let end = |k: usize| chunks.get(k + 1).map_or(u32::MAX, |next| next.from);
-        let cuts: Vec<ScanPass> =
+        let still: Vec<ScanPass> =
             (0..chunks.len()).map(|k| ScanPass { end: end(k), motion: Frame::identity() }).collect();
+        self.sum_up_moved(chunks, order, &still);
+    }
+
+    /// The same, each chunk moved as a pass is.
+    fn sum_up_moved(&self, chunks: &mut [Chunk], order: &[u32], moved: &[ScanPass]) {
         let locals = prepare(self.model);
         let starts: Vec<Frame> = self.model.spine().segments().iter().map(|s| s.start).collect();
         let add = |sums: &mut BTreeMap<(usize, usize), Sum>, chunk: usize, k: usize, p: [f64; 3]| {
@@ -275,7 +312,7 @@ impl Asked<'_> {
             }
         };
         let parts =
-            self.whole.only(order).moved(&cuts).walk_passes(self.model, self.cutoff_mm, BTreeMap::new, add);
+            self.whole.only(order).moved(moved).walk_passes(self.model, self.cutoff_mm, BTreeMap::new, add);
         for ((chunk, section), sum) in parts.into_iter().flatten() {
             *chunks[chunk].sums.entry(section).or_insert_with(Sum::zeros) += sum;
         }
@@ -283,6 +320,10 @@ impl Asked<'_> {
 
     /// The equations of the chunks' motions, the sections' values eliminated.
     fn blocks(&self, chunks: &[Chunk]) -> Blocks {
+        self.unsummed(chunks).summed()
+    }
+
+    fn unsummed(&self, chunks: &[Chunk]) -> Blocks {
         let (model, radius_mm) = (self.model, self.model.tube_radius_mm);
         let spine = model.spine();
         let mut blocks = Blocks::empty(chunks.len(), self.noise_mm, self.spread_mm);
@@ -295,7 +336,7 @@ impl Asked<'_> {
             let sums: Vec<(usize, Sum)> = chunks.iter().enumerate().filter_map(of).collect();
             blocks.add(&sums, &stiff);
         }
-        blocks.summed()
+        blocks
     }
 
     /// Weight and derivatives of a point; None when it is not on the tube.

@@ -142,11 +142,10 @@ impl Jury {
             }
             let mut tried = self.tried(&best);
             tried.sort_by(|a, b| a.1.score.total_cmp(&b.1.score));
-            let better = tried.first().is_some_and(|(_, c)| c.score < best.score - LEAST_GAIN);
-            if better {
-                let (change, candidate) = tried.swap_remove(0);
+            if let Some((i, better)) = self.better(&best, &tried) {
+                let (change, candidate) = tried.swap_remove(i);
                 self.decide(change.what, None, best.score - candidate.score, true);
-                best = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
+                best = better;
             } else if let Some(other) = self.moved(&best, &tried) {
                 best = other;
             } else {
@@ -158,6 +157,15 @@ impl Jury {
             }
         }
         best
+    }
+
+    /// The best of the tried changes that is better fitted to the end, too: an arc that has become too short to be oval scores as if it
+    /// still were, and so would be changed to and fro for ever.
+    fn better(&self, best: &Candidate, tried: &[(Change, Candidate)]) -> Option<(usize, Candidate)> {
+        let is_better = |candidate: &Candidate| candidate.score < best.score - LEAST_GAIN;
+        let better = tried.iter().enumerate().take_while(|(_, (_, candidate))| is_better(candidate));
+        let fitted = better.map(|(i, (_, c))| (i, self.fit(&c.model, FULL_STEPS, f64::INFINITY)));
+        fitted.into_iter().find(|(_, candidate)| is_better(candidate))
     }
 
     /// A tube that runs nowhere farther than `most_mm` from the line that the sections were taken about: changed as in the

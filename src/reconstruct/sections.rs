@@ -32,6 +32,9 @@ const SHRINK: f64 = 0.4;
 /// times more than is usual has some of them; and what its radius and ovality may be off at most, in tube radii.
 const DAMAGED_RADII: f64 = 2.0;
 const DAMAGED: f64 = 5.0;
+/// The outermost sections that hold less than this share of the usual points lie where the tube ends: most of theirs are not of its
+/// outside.
+const LEAST_FULL: f64 = 0.25;
 const TUBES_OWN: f64 = 1e-4;
 /// Cut-off of the biweight about the section's own fit, in standard deviations.
 const CUTOFF_SIGMAS: f64 = 6.0;
@@ -395,9 +398,16 @@ fn damaged_ends(
     let misfit =
         |s: &Section| (cost(&s.sums, &solve(&s.sums, &shape, noise_mm)) - s.least) / (noise_mm * noise_mm);
     let usual = median(&mut sections.iter().map(misfit).collect::<Vec<_>>()).unwrap_or(0.0);
-    let is_damaged = |s: &Section| {
+    let full = median(&mut sections.iter().map(|s| s.count).collect::<Vec<_>>()).unwrap_or(0.0);
+    let is_full = |s: &Section| s.count >= LEAST_FULL * full;
+    let (first, last) = (sections.iter().position(is_full), sections.iter().rposition(is_full));
+    let seen = first.unwrap_or(0)..=last.unwrap_or(0);
+    let is_damaged = |(i, s): &(usize, Section)| {
         let at_mm = spine.closest(&s.centre).arc_length_mm;
-        may_be_damaged(base, spine, at_mm) && misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2)
+        may_be_damaged(base, spine, at_mm)
+            && (!seen.contains(i) || misfit(s) > DAMAGED * usual.max(MEDIAN_CHI2))
     };
-    sections.into_iter().partition(is_damaged)
+    let (damaged, sound): (Vec<_>, Vec<_>) = sections.into_iter().enumerate().partition(is_damaged);
+    let alone = |sections: Vec<(usize, Section)>| sections.into_iter().map(|(_, s)| s).collect();
+    (alone(damaged), alone(sound))
 }

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use super::arcline::{Limits, approximate};
 use super::evidence::Solved;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, RadiusPrior, fit};
+use super::flattening::freed;
 use super::model::{Flattening, Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::{
@@ -78,6 +79,8 @@ pub struct Shown<'a> {
     pub radius_mm: f64,
     /// How flat the outer walls of the bends are, as far as is known.
     pub flattening: Flattening,
+    /// The tube as a search that knew less of them found it.
+    pub before: Option<TubeModel>,
     /// All of the tube's points as they lie in the file.
     pub whole: Whole<'a>,
 }
@@ -92,6 +95,7 @@ impl<'a> Shown<'a> {
             sample,
             radius_mm: scene.radius_mm,
             flattening: Flattening::NONE,
+            before: None,
             whole,
         }
     }
@@ -120,6 +124,13 @@ pub struct Structure {
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(shown: &Shown) -> Option<Structure> {
+    let (jury, best) = searched(shown, None)?;
+    let again = shown.before.as_ref().and_then(|before| searched(shown, Some(before)));
+    Some(jury.confirmed(shown.sample, best.model, again.map(|(_, other)| other.model)))
+}
+
+/// The best tube that a search finds from the polygon, or from a tube that was found before.
+fn searched(shown: &Shown, before: Option<&TubeModel>) -> Option<(Jury, Candidate)> {
     let Shown { polygon, sample, radius_mm, whole, .. } = *shown;
     let way = CentreLine::of_polygon(polygon, radius_mm);
     let mut jury = Jury {
@@ -138,7 +149,10 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
         starts.par_iter().map(|m| jury.fit(m, FULL_STEPS, f64::INFINITY)).collect();
     rough.sort_by(|a, b| a.score.total_cmp(&b.score));
     rough.dedup_by(|b, a| b.score - a.score < SAME_SCORE && b.parameters.len() == a.parameters.len());
-    let first = jury.nearer(rough.first()?.clone(), STRAYED_RADII * radius_mm);
+    let first = match before {
+        Some(before) => jury.judge(TubeModel { flattening: shown.flattening.clone(), ..before.clone() }),
+        None => jury.nearer(rough.first()?.clone(), STRAYED_RADII * radius_mm),
+    };
     jury.line = CentreLine::measure(sample, &first.model, false);
     rough.insert(0, first);
     let fitted: Vec<Candidate> =
@@ -157,7 +171,7 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     best = jury.united(best);
     let passes_mm = stripes::disagreement_mm(&whole, &best.model, jury.line.noise_mm);
     best = jury.material(best, passes_mm);
-    Some(jury.confirmed(sample, best.model))
+    Some((jury, best))
 }
 
 /// The arc-line spline of the polygon at a tolerance.
@@ -302,18 +316,25 @@ impl Jury {
         Structure { noise_mm, correlation, crowded, prior, held, undecided, decisions, model }
     }
 
-    /// The structure fitted to the points themselves, without the bends that they do not confirm: a section of few
-    /// points may have taken some that are not the tube's for its own.
-    fn confirmed(mut self, sample: &[Point3<f64>], model: TubeModel) -> Structure {
-        let sample = sample.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
-        let mut sample = Sample::new(sample, &model);
-        let (mut best, mut score) = self.fit_points(&mut sample, &model);
+    /// The structure fitted to the points themselves, or another that they find better, without the bends that they do not confirm:
+    /// a section of few points may have taken some that are not the tube's for its own.
+    fn confirmed(mut self, points: &[Point3<f64>], model: TubeModel, other: Option<TubeModel>) -> Structure {
+        let sound = points.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
+        let mut sample = Sample::new(sound, &model);
+        let known = model.flattening.clone();
+        let (mut best, mut score) = self.fit_walls(&mut sample, &model);
+        let other = other.map(|model| self.fit_walls(&mut sample, &model)).filter(|o| o.1 < score);
+        if let Some(other) = other {
+            self.decide("the tube as found without flat walls".to_owned(), None, score - other.1, true);
+            self.line = CentreLine::measure(points, &other.0.model, true);
+            (best, score) = other;
+        }
         loop {
-            let fewer = self.with_fewer(&best);
-            let fitted = fewer.into_iter().map(|(what, model)| (what, self.fit_points(&mut sample, &model)));
+            let fewer = self.with_fewer(&best, &known);
+            let fitted = fewer.into_iter().map(|(what, model)| (what, self.fit_walls(&mut sample, &model)));
             let least = fitted.min_by(|a, b| a.1.1.total_cmp(&b.1.1)).filter(|l| l.1.1 < score);
             let Some((what, better)) = least else {
-                return self.structure(best.model);
+                return self.structure(TubeModel { flattening: known, ..best.model });
             };
             let what = format!("{what}, not confirmed by the points, taken back");
             self.decide(what, None, score - better.1, true);
@@ -322,21 +343,27 @@ impl Jury {
     }
 
     /// The tube without one of the bends that the points may not confirm; in words what goes.
-    fn with_fewer(&self, best: &Fit) -> Vec<(String, TubeModel)> {
-        let bends = &best.model.lra.bends;
+    fn with_fewer(&self, best: &Fit, known: &Flattening) -> Vec<(String, TubeModel)> {
+        let model = TubeModel { flattening: known.clone(), ..best.model.clone() };
+        let bends = &model.lra.bends;
         let bearable = DOUBT * self.price(5, 1) * self.correlation;
         let uncertain = |i: usize| {
             let at = best.parameters.iter().position(|p| *p == Parameter::Angle(i));
             at.is_some_and(|j| bends[i].angle_rad.powi(2) < bearable * best.covariance[(j, j)])
         };
-        let spine = best.model.spine();
+        let spine = model.spine();
         let at_mm = |i: usize| spine.segments()[2 * i + 1].start_mm;
+        let is_doubtful = |i: usize| {
+            is_beside_an_end(&model, i)
+                || uncertain(i)
+                || *known != Flattening::NONE && may_be_a_wall(&model, i)
+        };
         let dropped = (0..bends.len())
-            .filter(|&i| is_beside_an_end(&best.model, i) || uncertain(i))
-            .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&best.model, i)));
-        let pairs = shallow_pairs(&best.model).into_iter().filter_map(|i| {
+            .filter(|&i| is_doubtful(i))
+            .map(|i| (format!("the bend at {:.0} mm", at_mm(i)), without_bend(&model, i)));
+        let pairs = shallow_pairs(&model).into_iter().filter_map(|i| {
             let what = format!("two bends at {:.0} and {:.0} mm", at_mm(i - 1), at_mm(i));
-            Some((what, merged(&best.model, i)?))
+            Some((what, merged(&model, i)?))
         });
         dropped.chain(pairs).collect()
     }
@@ -349,6 +376,21 @@ impl Jury {
         let score = misfit + self.price(found.parameters.len(), model.lra.bends.len());
         (found, score)
     }
+
+    /// The same with the outer walls free where some are flat: a wall for which a bend stands shows only without that bend.
+    fn fit_walls(&self, sample: &mut Sample, model: &TubeModel) -> (Fit, f64) {
+        let flattening = if model.flattening == Flattening::NONE { Flattening::NONE } else { freed(model) };
+        self.fit_points(sample, &TubeModel { flattening, ..model.clone() })
+    }
+}
+
+/// Whether a bend is so near to a larger one that it may stand for that one's flat wall.
+fn may_be_a_wall(model: &TubeModel, i: usize) -> bool {
+    let bends = &model.lra.bends;
+    let is_hiding = |k: usize, between: usize| {
+        bends[between].length_mm < model.tube_radius_mm && bends[k].angle_rad > bends[i].angle_rad
+    };
+    (i > 0 && is_hiding(i - 1, i)) || (i + 1 < bends.len() && is_hiding(i + 1, i + 1))
 }
 
 /// Whether a bend is so near to an end that burr, bore and face may be in its sections.

@@ -2,6 +2,8 @@
 //!
 //! Under `realign`: sums of many small chunks, from which the equations of any few passes follow without the points.
 
+use std::ops::AddAssign;
+
 use nalgebra::{Cholesky, DMatrix, DVector, Matrix5, SMatrix, SVector};
 
 use super::super::section::VALUES;
@@ -74,6 +76,17 @@ impl Blocks {
             let mut right = self.right.fixed_rows_mut::<MOTION>(at);
             right -= sum.fixed_view::<MOTION, 1>(VALUES, RESIDUAL) - felt.transpose() * left;
         }
+    }
+
+    /// The equations of chunks that were summed where these motions took them, for motions from where they lay before.
+    pub fn about(mut self, motions: &DVector<f64>) -> Blocks {
+        let n = MOTION * self.chunks;
+        let taken = motions.rows(0, n);
+        let right = self.square.view((0, 0), (n, n)) * taken;
+        let radius = self.square.view((0, n), (n, 1)).dot(&taken);
+        self.right.rows_mut(0, n).add_assign(&right);
+        self.right[n] += radius;
+        self
     }
 
     /// Every block with all blocks before it, so that those of consecutive chunks together are a few differences.
