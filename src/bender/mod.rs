@@ -62,6 +62,7 @@ pub use driver::{IntentLog, LogError, deliver};
 pub use exchange::{
     Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
 };
+pub use folder::SharedFolder;
 pub use folder_port::{FolderPort, Letter};
 pub use limits::{Reason, check_limits};
 pub use line::Wire;
@@ -70,6 +71,7 @@ pub use open::{Opener, serial_port};
 pub use profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
+pub use serial_table::SerialTable;
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{

@@ -214,7 +214,7 @@ pub(super) fn check_constants(
 /// The value in whole steps, if an i32 can hold it.
 pub(super) fn counts(value: f64, resolution: f64) -> Option<i32> {
     let steps = (value / resolution).round();
-    (steps.abs() <= f64::from(i32::MAX)).then_some(steps as i32)
+    (f64::from(i32::MIN)..=f64::from(i32::MAX)).contains(&steps).then_some(steps as i32)
 }
 
 pub(super) fn u32_at(order: WordOrder, bytes: &[u8], at: usize) -> u32 {
@@ -304,6 +304,19 @@ mod tests {
         assert_eq!(payload[at..at + 4], 60_000_i32.to_be_bytes());
         let (_, back) = decode_payload(&p, &payload).unwrap();
         assert!((back.bends[1].rotation_rad.to_degrees() + 60.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_least_number_is_one_too() {
+        for reversed in [false, true] {
+            let mut p = profile();
+            p.table.rotation_reversed = reversed;
+            let mut payload = encode_payload(&p, "AB-1", &table()).unwrap();
+            let at = p.payload_header_bytes() + 4;
+            payload[at..at + 4].copy_from_slice(&i32::MIN.to_be_bytes());
+            let (program, least) = decode_payload(&p, &payload).unwrap();
+            assert_eq!(encode_payload(&p, &program, &least).unwrap(), payload);
+        }
     }
 
     #[test]
