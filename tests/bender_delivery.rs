@@ -9,8 +9,8 @@
 use std::collections::BTreeMap;
 
 use benderd::bender::{
-    Action, ActiveTable, Delivery, Event, Job, Outcome, Profile, Status, TableId, commit_image, crc_of,
-    decode_status, encode_payload, staging_image, status_span,
+    Action, ActiveTable, Delivery, Event, Job, Operation, Outcome, Profile, Status, TableId, commit_image,
+    crc_of, decode_status, encode_payload, staging_image, status_span,
 };
 use benderd::sim::bender::{MachineEvent, MachineModel};
 use benderd::tube::CommandTable;
@@ -73,7 +73,13 @@ impl World {
                 .unwrap();
             assert!(matches!(machine.tick(), Some(MachineEvent::Refused { .. })));
         }
-        let job = Job { program: "P1".into(), table: table(&mut rng), expected_active: None };
+        let job = Job {
+            program: "P1".into(),
+            table: table(&mut rng),
+            expected_active: None,
+            operation: Operation::New,
+            approved: false,
+        };
         let meant = BTreeMap::from([(machine.active(), machine.active_payload())]);
         let world = World {
             rng,

@@ -5,7 +5,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use benderd::bender::{Bender as _, Link, LinkError, Profile, TableId, Transport, Wire};
+use benderd::bender::{Bender as _, Device, Link, LinkError, Profile, TableId, Transport, Wire};
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::{Door, Speech};
@@ -25,7 +25,7 @@ const QUIET_MS: u64 = 500;
 fn profile() -> Profile {
     let mut profile = Profile::load("reference-rtu").unwrap();
     profile.deadlines.request = Duration::from_millis(REQUEST_MS);
-    let Transport::ModbusRtu(map, ..) = &mut profile.transport else { panic!() };
+    let Transport::ModbusRtu(Device::Staged(map), ..) = &mut profile.transport else { panic!() };
     map.max_read_registers = 4;
     profile
 }

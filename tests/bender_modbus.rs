@@ -5,8 +5,8 @@
 use std::time::Duration;
 
 use benderd::bender::{
-    Bender, Intent, IntentLog, Job, Link, LinkError, LogError, Outcome, Profile, TableId, Transport,
-    WordOrder, deliver,
+    Bender, Device, Intent, IntentLog, Job, Link, LinkError, LogError, Operation, Outcome, Profile, TableId,
+    Transport, WordOrder, deliver,
 };
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
@@ -51,7 +51,7 @@ fn profile() -> Profile {
 fn job(bends: usize) -> Job {
     let row = |i| CommandRow { length_mm: 20.0 + i as f64, rotation_rad: -0.5, angle_rad: 1.0 };
     let table = CommandTable { bends: (0..bends).map(row).collect(), last_length_mm: 70.0 };
-    Job { program: "P1".into(), table, expected_active: None }
+    Job { program: "P1".into(), table, expected_active: None, operation: Operation::New, approved: false }
 }
 
 async fn bender(profile: &Profile, bends: u16, fault: Option<Fault>) -> SimulatedBender {
@@ -70,7 +70,7 @@ async fn a_table_is_delivered_whatever_the_word_order_and_the_size_of_requests()
         for limit in [4, 10, 100, 122] {
             let mut profile = profile();
             profile.table.word_order = order;
-            let Transport::ModbusTcp(map) = &mut profile.transport else { panic!() };
+            let Transport::ModbusTcp(Device::Staged(map)) = &mut profile.transport else { panic!() };
             map.max_write_registers = limit;
             map.max_read_registers = limit.max(36);
             let bender = bender(&profile, 40, None).await;

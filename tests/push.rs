@@ -231,6 +231,40 @@ async fn what_breaks_a_limit_is_refused_without_a_connection() {
 }
 
 /// An answer of `benderd correct` with one reason.
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_correction_applies_to_what_was_committed_last_or_not_at_all() {
+    let shop = Shop::open(None).await;
+    let first = shop.push("bracket.csv", &["--correct"]).await;
+    assert_eq!(code(&first), 2);
+    assert!(stderr(&first).contains("nothing that was committed"), "{}", stderr(&first));
+    assert_eq!(code(&shop.push("bracket.csv", &[]).await), 0);
+    shop.write("better.csv", &LRA.replace("92.1", "92.6"));
+    let corrected = shop.push("better.csv", &["--correct", "--program", "bracket"]).await;
+    assert_eq!(code(&corrected), 0, "{}", stderr(&corrected));
+    // Somebody changes the second bend at the machine's screen.
+    shop.bender.with(|m| {
+        let mut payload = m.active_payload();
+        let at = payload.len() - 4;
+        payload[at..].copy_from_slice(&47_000_i32.to_be_bytes());
+        m.edit_at_screen(payload);
+    });
+    shop.write("best.csv", &LRA.replace("92.1", "92.7"));
+    for more in [
+        &["--correct", "--program", "bracket", "--dry-run", "--journal", "journal.db"][..],
+        &["--correct", "--program", "bracket"],
+    ] {
+        let refused = shop.push("best.csv", more).await;
+        assert_eq!(code(&refused), 1, "{}", stderr(&refused));
+        assert!(
+            stderr(&refused).contains("bend 2: angle 46.350 deg was committed, the machine holds 47.000"),
+            "{}",
+            stderr(&refused)
+        );
+    }
+    assert_eq!(code(&shop.push("best.csv", &["--program", "bracket"]).await), 0, "made anew");
+}
+
 fn answer(verdict: &str) -> String {
     format!(
         r#"{{{verdict} "commanded": {{"bends": [

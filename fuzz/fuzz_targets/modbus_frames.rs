@@ -32,6 +32,10 @@ fn body(heard: &Heard) -> Option<Vec<u8>> {
             body.push(3);
             body.extend([address.to_be_bytes(), count.to_be_bytes()].concat());
         }
+        Request::ReadCoils { address, count } => {
+            body.push(1);
+            body.extend([address.to_be_bytes(), count.to_be_bytes()].concat());
+        }
         Request::Write { address, words } => {
             body.push(16);
             body.extend([address.to_be_bytes(), (words.len() as u16).to_be_bytes()].concat());
@@ -113,7 +117,9 @@ fuzz_target!(|data: &[u8]| {
                 let quiet = !machine.listener.is_amid();
                 let heard: Vec<Heard> = frame.chunks(cut).flat_map(|piece| machine.hear(piece)).collect();
                 let whole = Listener::new(framing).take(&frame);
-                if quiet && (framing == Framing::Tcp || whole.iter().any(|heard| body(heard).is_some())) {
+                // Of RTU's only one known request: nobody can tell where an unknown one ends.
+                let is_one = |one: &Heard| body(one).is_some_and(|body| wrapped(framing, 0, &body) == frame);
+                if quiet && (framing == Framing::Tcp || whole.first().is_some_and(is_one)) {
                     assert_eq!(heard, whole, "in pieces of {cut}");
                 }
             }

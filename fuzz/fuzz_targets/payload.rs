@@ -1,10 +1,12 @@
-//! Payloads of any bytes, in every word order and direction of rotation: a table that is decoded encodes to the same bytes.
+//! Payloads of any bytes, in every word order, sequence and direction of rotation: a table that is decoded encodes to the same bytes.
 
 #![no_main]
 
 use std::sync::LazyLock;
 
-use benderd::bender::{Profile, WordOrder, check_limits, decode_payload, encode_payload, payload_bytes};
+use benderd::bender::{
+    Profile, Sequence, WordOrder, check_limits, decode_payload, encode_payload, payload_bytes,
+};
 use benderd_fuzz::Script;
 use libfuzzer_sys::fuzz_target;
 
@@ -16,6 +18,9 @@ fuzz_target!(|data: &[u8]| {
     let mut script = Script::new(data);
     let mut profile = PROFILE.clone();
     let how = script.any();
+    let sequence = |bit: u8| if bit == 0 { Sequence::Incremental } else { Sequence::Cumulative };
+    let counted = script.any();
+    (profile.table.feed, profile.table.rotation) = (sequence(counted & 1), sequence(counted & 2));
     profile.table.word_order = ORDERS[usize::from(how & 3)];
     profile.table.rotation_reversed = how & 4 != 0;
     profile.table.length_resolution_mm = [0.01, 1e-4, 0.0254, 1.0][usize::from(how >> 3 & 3)];

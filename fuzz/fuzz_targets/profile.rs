@@ -5,7 +5,7 @@
 
 use benderd::bender::plan::{Request, delivery, rows};
 use benderd::bender::{
-    ModbusMap, Profile, decode_payload, decode_status, decode_status_image, encode_payload, fields,
+    ModbusMap, Profile, Sequence, decode_payload, decode_status, decode_status_image, encode_payload, fields,
     payload_bytes, status_span,
 };
 use benderd::config::Document;
@@ -14,12 +14,13 @@ use benderd::tube::{CommandRow, CommandTable};
 use benderd_fuzz::Script;
 use libfuzzer_sys::fuzz_target;
 
-const SHIPPED: [&str; 5] = [
+const SHIPPED: [&str; 6] = [
     include_str!("../../protocols/reference-modbus.toml"),
     include_str!("../../protocols/reference-rtu.toml"),
     include_str!("../../protocols/reference-rtu-over-tcp.toml"),
     include_str!("../../protocols/reference-serial.toml"),
     include_str!("../../protocols/reference-folder.toml"),
+    include_str!("../../protocols/ten-row.toml"),
 ];
 
 /// First register of an area and the one behind it.
@@ -75,10 +76,21 @@ fn table(profile: &Profile) {
         angle_rad: limits.max_angle_rad,
     };
     let table = CommandTable { bends: vec![row; limits.max_bends], last_length_mm: limits.max_length_mm };
-    let payload = encode_payload(profile, "P", &table).unwrap();
-    assert_eq!(payload.len(), payload_bytes(profile, limits.max_bends));
-    let (program, back) = decode_payload(profile, &payload).unwrap();
-    assert_eq!(encode_payload(profile, &program, &back).unwrap(), payload);
+    let steps = |sequence| sequence == Sequence::Incremental;
+    let fits =
+        steps(profile.table.feed) && steps(profile.table.rotation) && profile.transport.direct().is_none();
+    match encode_payload(profile, "P", &table) {
+        Ok(payload) => {
+            assert_eq!(payload.len(), payload_bytes(profile, limits.max_bends));
+            let (_, back) = decode_payload(profile, &payload).unwrap();
+            // Where rows are written directly, those without an angle at the end are none.
+            let cut = profile.transport.direct().is_some() && back.bends.len() < limits.max_bends;
+            assert!(cut || encode_payload(profile, "P", &back).unwrap() == payload);
+            assert!(!cut || limits.max_angle_rad < limits.angle_resolution_rad);
+        }
+        // Positions, and 16 bits, may not reach as far as the limits.
+        Err(reasons) => assert!(!fits && reasons.iter().all(|r| r.code == "not_encodable"), "{reasons:?}"),
+    }
     assert!(limits.min_first_length_mm <= limits.max_length_mm, "no table can be made");
     assert!(limits.min_between_mm <= limits.max_length_mm, "no table of two bends can be made");
 }
@@ -99,8 +111,9 @@ fn machine(profile: &Profile) {
 fn parts(profile: &Profile, text: &str) {
     let written: toml::Table = toml::from_str(text).unwrap();
     let has = |name: &str| written.contains_key(name);
-    let modbus = profile.transport.modbus().is_some();
-    assert!(has("modbus") == modbus && has("registers") == modbus);
+    assert_eq!(has("modbus"), profile.transport.device().is_some());
+    assert_eq!(has("registers"), profile.transport.modbus().is_some());
+    assert_eq!(has("direct"), profile.transport.direct().is_some());
     assert_eq!(has("line"), profile.transport.line().is_some());
     assert_eq!(has("serial"), profile.transport.serial().is_some());
 }

@@ -1,6 +1,7 @@
 //! The link that a profile asks for.
 
 use super::contact::RulesError;
+use super::direct::DirectLink;
 use super::folder::SharedFolder;
 use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus::ModbusLink;
@@ -8,13 +9,15 @@ use super::open::Opener;
 use super::profile::Profile;
 use super::serial_table::SerialTable;
 use super::table_link::TableLink;
-use super::transport::Transport;
+use super::transport::{Device, Transport};
 use super::wire::{Staged, Status, TableId};
 
 /// A link of any kind.
 pub enum Link {
     /// Modbus, whatever it goes over.
     Modbus(Box<ModbusLink>),
+    /// Modbus, with rows that are in force as soon as they are written.
+    Direct(Box<DirectLink>),
     /// A serial port with a protocol of its own.
     Serial(Box<TableLink<SerialTable>>),
     /// A folder that both reach.
@@ -34,12 +37,16 @@ impl Link {
 
     fn made(profile: Profile, endpoint: String, opener: Option<Opener>) -> Result<Link, RulesError> {
         Ok(match &profile.transport {
-            Transport::ModbusTcp(map)
-            | Transport::ModbusRtu(map, ..)
-            | Transport::ModbusRtuOverTcp(map, _) => {
-                let map = map.clone();
-                Link::Modbus(Box::new(ModbusLink::new(profile, map, endpoint, opener)?))
-            }
+            Transport::ModbusTcp(device)
+            | Transport::ModbusRtu(device, ..)
+            | Transport::ModbusRtuOverTcp(device, _) => match device.clone() {
+                Device::Staged(map) => {
+                    Link::Modbus(Box::new(ModbusLink::new(profile, map, endpoint, opener)?))
+                }
+                Device::Direct(map) => {
+                    Link::Direct(Box::new(DirectLink::new(profile, map, endpoint, opener)?))
+                }
+            },
             Transport::SerialTable(unit, ..) => {
                 let protocol = SerialTable::new(&profile, *unit, opener);
                 Link::Serial(Box::new(TableLink::new(profile, protocol, endpoint)?))
@@ -57,6 +64,7 @@ macro_rules! each {
     ($link:expr, $inner:ident => $call:expr) => {
         match $link {
             Link::Modbus($inner) => $call,
+            Link::Direct($inner) => $call,
             Link::Serial($inner) => $call,
             Link::Folder($inner) => $call,
         }

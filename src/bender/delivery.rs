@@ -5,6 +5,8 @@
 //!   gate         1 table        bit for bit   gate again   on disk         once     the truth
 //! ```
 //!
+//! A correction begins with the table in force instead (`recall`): it must be the one that was committed last.
+//!
 //! One event in (with the time, in milliseconds of the driver's clock), one action out. Three things hold
 //! whatever happens: a commit goes out at most once, never before an equal read-back and a journalled intent;
 //! after the commit only reads decide; and what cannot be decided before the deadline is `Unknown`.
@@ -14,6 +16,7 @@ use serde::Serialize;
 use super::limits::{Reason, check_limits};
 use super::link::ActiveTable;
 use super::profile::{Deadlines, Profile};
+use super::recall::{Operation, objections};
 use super::wire::{Ack, Staged, Status, TableId, crc_of, encode_payload, staging_image};
 use crate::tube::CommandTable;
 
@@ -26,6 +29,10 @@ pub struct Job {
     pub table: CommandTable,
     /// The table that must be in force, where the caller knows: another one was made at the machine.
     pub expected_active: Option<TableId>,
+    /// Whether it makes the rows or corrects what was committed last.
+    pub operation: Operation,
+    /// Whether the operator approved this write: a machine without a staging area takes none without.
+    pub approved: bool,
 }
 
 /// A job that broke no limit, as bytes.
@@ -130,6 +137,8 @@ pub enum Action {
 /// What is waited for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
+    /// The table that is to be corrected.
+    Recalling,
     /// The first status.
     Asking,
     /// The staging area being written.
@@ -187,7 +196,13 @@ pub fn prepare(profile: &Profile, job: &Job) -> Result<Prepared, Vec<Reason>> {
 
 /// Why this job may not go to a machine in this status; empty when it may.
 pub fn gate(profile: &Profile, job: &Prepared, status: &Status) -> Vec<Reason> {
-    let mut reasons = identity(job, status);
+    let direct = profile.transport.direct().is_some();
+    let mut reasons = if direct { Vec::new() } else { identity(job, status) };
+    if direct && !job.job.approved {
+        let text = "this machine has no staging area: what is written is in force at once, half of it too; the operator must see \
+                    that nothing is bent and the right program is loaded, and approve the write";
+        reasons.push(Reason::new("approval", None, text));
+    }
     for bit in &profile.state_bits {
         let set = status.state >> bit.bit & 1 == 1;
         if set != bit.must_be {
@@ -252,8 +267,9 @@ impl Delivery {
         };
         let action = match prepare(profile, job) {
             Ok(prepared) => {
+                let corrects = matches!(prepared.job.operation, Operation::Correct { .. });
                 delivery.job = Some(prepared);
-                Action::ReadStatus
+                if corrects { delivery.go(State::Recalling, Action::ReadActive) } else { Action::ReadStatus }
             }
             Err(reasons) => delivery.finish(Outcome::Rejected { reasons }),
         };
@@ -264,6 +280,7 @@ impl Delivery {
     pub fn on(&mut self, event: Event, now_ms: u64) -> Action {
         match (self.state, event) {
             (State::Done, _) => self.finished(),
+            (State::Recalling, Event::ActiveRead(active)) => self.recall(active, now_ms),
             (State::Asking, Event::StatusRead(status)) => self.stage(status, now_ms),
             (State::Staging, Event::Written) => {
                 self.go(State::Comparing, Action::ReadStaging { bytes: self.image.len() })
@@ -287,10 +304,25 @@ impl Delivery {
         }
     }
 
+    /// Before a correction: the machine still holds what was committed, or already what is to be.
+    fn recall(&mut self, active: ActiveTable, now_ms: u64) -> Action {
+        let Some(Prepared { job, crc, .. }) = &self.job else { return self.finished() };
+        if let Operation::Correct { last } = &job.operation
+            && *crc != active.status.active.crc
+        {
+            let reasons = objections(&self.profile, &job.program, last, &job.table, &active);
+            if !reasons.is_empty() {
+                return self.finish(Outcome::Rejected { reasons });
+            }
+        }
+        self.stage(active.status, now_ms)
+    }
+
     /// Step 1: who is there; step 2: write the staging area.
     fn stage(&mut self, status: Status, now_ms: u64) -> Action {
         let Some(job) = &self.job else { return self.finished() };
-        let wrong = identity(job, &status);
+        let direct = self.profile.transport.direct().is_some();
+        let wrong = if direct { Vec::new() } else { identity(job, &status) };
         if wrong.is_empty() && status.active.revision != 0 && status.active.crc == job.crc {
             return self.finish(Outcome::AlreadyActive(status.active));
         }
@@ -299,7 +331,8 @@ impl Delivery {
             return self.finish(Outcome::Rejected { reasons });
         }
         // The gate keeps the sum from overflowing.
-        self.id = TableId { revision: status.active.revision.wrapping_add(1), crc: job.crc };
+        let revision = status.active.revision.wrapping_add(u32::from(!direct)); // such a machine counts none
+        self.id = TableId { revision, crc: job.crc };
         let staged = Staged { id: self.id, payload: job.payload.clone() };
         self.image = staging_image(&self.profile, &staged);
         self.first = Some((status, now_ms));
@@ -336,7 +369,7 @@ impl Delivery {
                 format!("the active table changed from {} to {} meanwhile", first.active, status.active);
             reasons.push(Reason::new("table_changed", None, text));
         }
-        if status.heartbeat == first.heartbeat {
+        if self.profile.transport.direct().is_none() && status.heartbeat == first.heartbeat {
             let waited = now_ms.saturating_sub(*first_ms);
             if reasons.is_empty() && waited < self.profile.deadlines.heartbeat_ms {
                 let until_ms = now_ms + self.profile.deadlines.poll_ms;

@@ -11,6 +11,8 @@ fn job() -> Job {
         program: "P1".into(),
         table: CommandTable { bends: vec![row], last_length_mm: 50.0 },
         expected_active: None,
+        operation: Operation::New,
+        approved: false,
     }
 }
 

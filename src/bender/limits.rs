@@ -6,7 +6,7 @@
 use serde::Serialize;
 
 use super::profile::Profile;
-use super::wire::counts;
+use super::rows::{Steps, steps_of};
 use crate::tube::CommandTable;
 
 /// One reason for a refusal, in the form of `benderd correct`.
@@ -50,26 +50,27 @@ pub fn check_limits(profile: &Profile, table: &CommandTable) -> Vec<Reason> {
         reasons.push(Reason::new("row_count", None, text));
     }
     let (mm, deg) = (profile.table.length_resolution_mm, profile.table.angle_resolution_deg);
-    let mut check = |row: usize, code, what: &str, unit: &str, value: f64, range: (f64, f64), step: f64| {
-        let Some(found) = counts(value, step) else { return }; // the encoding says so itself
-        // Limits in whole steps, rounded inwards; the small term forgives the division.
-        let (least, most) = ((range.0 / step - 1e-6).ceil(), (range.1 / step + 1e-6).floor());
-        if !(least..=most).contains(&f64::from(found)) {
-            let decimals = if step < 0.01 { 3 } else { 2 };
-            let text = format!(
-                "{what} {value:.decimals$} {unit}, the machine takes {:.decimals$} to {:.decimals$}",
-                range.0, range.1
-            );
-            reasons.push(Reason::new(code, Some(row), text));
-        }
-    };
+    let mut check =
+        |row: usize, code, unit: &str, (value, found): (f64, f64), range: (f64, f64), step: f64| {
+            // Limits in whole steps, rounded inwards; the small term forgives the division.
+            let (least, most) = ((range.0 / step - 1e-6).ceil(), (range.1 / step + 1e-6).floor());
+            if !(least..=most).contains(&found) {
+                let decimals = if step < 0.01 { 3 } else { 2 };
+                let text = format!(
+                    "{code} {value:.decimals$} {unit}, the machine takes {:.decimals$} to {:.decimals$}",
+                    range.0, range.1
+                );
+                reasons.push(Reason::new(code, Some(row), text));
+            }
+        };
     let turn = limits.max_rotation_rad.to_degrees();
-    for (i, row) in table.bends.iter().enumerate() {
+    let steps = steps_of(&profile.table, table);
+    for (i, (row, Steps { moves, .. })) in table.bends.iter().zip(steps).enumerate() {
         let shortest = if i == 0 { limits.min_first_length_mm } else { limits.min_between_mm };
-        check(i + 1, "length", "length", "mm", row.length_mm, (shortest, limits.max_length_mm), mm);
-        check(i + 1, "rotation", "rotation", "deg", row.rotation_rad.to_degrees(), (-turn, turn), deg);
+        check(i + 1, "length", "mm", (row.length_mm, moves[0]), (shortest, limits.max_length_mm), mm);
+        check(i + 1, "rotation", "deg", (row.rotation_rad.to_degrees(), moves[1]), (-turn, turn), deg);
         let angle = (0.0, limits.max_angle_rad.to_degrees());
-        check(i + 1, "angle", "angle", "deg", row.angle_rad.to_degrees(), angle, deg);
+        check(i + 1, "angle", "deg", (row.angle_rad.to_degrees(), moves[2]), angle, deg);
     }
     reasons
 }

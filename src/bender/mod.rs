@@ -7,14 +7,16 @@
 //! profile       what one machine is: addresses, scales, limits, deadlines (protocols/*.toml)
 //! transport     which link leads there
 //! limits        the gate's figures: travel, clamp lengths, row count
-//! wire          tables to bytes and back, CRC
+//! rows          tables to the machine's whole steps and back; wire: to bytes and back, CRC
 //! delivery      stage, verify, commit: events and time in, one action out
+//! recall        a correction applies to what was committed last, or not at all
 //! driver        performs the actions on a link and a journal
 //! contact       when a link connects, asks, keeps silent: events and time in, one action out
 //! caller        one machine's connection, under every link
 //! any_link      the link that a profile asks for
 //!
-//! modbus        machines with registers: TCP, RTU, RTU over TCP
+//! modbus        machines with registers: TCP, RTU, RTU over TCP; modbus_client: one request after the other
+//! direct        machines whose rows are in force as soon as they are written
 //! registers     where their values are; plan: the requests that makes
 //!
 //! table_link    machines with objects: one exchange after the other
@@ -30,6 +32,7 @@ mod any_link;
 mod caller;
 mod contact;
 mod delivery;
+mod direct;
 mod driver;
 mod exchange;
 mod folder;
@@ -40,13 +43,16 @@ mod line;
 mod line_port;
 mod link;
 mod modbus;
+mod modbus_client;
 mod open;
 pub mod plan;
 mod profile;
 mod profile_file;
 mod profile_modbus;
 mod profile_transport;
+mod recall;
 mod registers;
+mod rows;
 mod rs485;
 mod serial_frame;
 mod serial_table;
@@ -58,6 +64,7 @@ mod wire;
 pub use any_link::Link;
 pub use contact::RulesError;
 pub use delivery::{Action, Delivery, Event, Intent, Job, Outcome, gate, prepare};
+pub use direct::DirectMap;
 pub use driver::{IntentLog, LogError, deliver};
 pub use exchange::{
     Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
@@ -68,12 +75,13 @@ pub use limits::{Reason, check_limits};
 pub use line::Wire;
 pub use link::{ActiveTable, Bender, LinkError};
 pub use open::{Opener, serial_port};
-pub use profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
+pub use profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
 pub use profile_file::shipped_profiles;
+pub use recall::{Operation, objections};
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
 pub use serial_table::SerialTable;
 pub use status_image::{decode_status_image, status_bytes};
-pub use transport::{LineSettings, Parity, SerialSettings, Transport};
+pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{
     Ack, Staged, Status, TableId, check_program, commit_image, crc_of, decode_payload, encode_payload,
     payload_bytes, staging_image,

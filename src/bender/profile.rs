@@ -5,6 +5,9 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
+use serde::Deserialize;
+
 use super::transport::Transport;
 use crate::tube::MachineLimits;
 
@@ -71,6 +74,23 @@ pub struct TableFormat {
     pub angle_resolution_deg: f64,
     /// Whether the machine turns the plane the other way than LRA's right hand.
     pub rotation_reversed: bool,
+    /// How lengths are counted.
+    pub feed: Sequence,
+    /// How rotations are counted.
+    pub rotation: Sequence,
+    /// What the machine's screen calls length, rotation, angle.
+    pub columns: [String; 3],
+}
+
+/// How the numbers of a column are counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Sequence {
+    /// Each row from the one before.
+    #[default]
+    Incremental,
+    /// All from the first on.
+    Cumulative,
 }
 
 /// One condition on the state word.

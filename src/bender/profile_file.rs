@@ -9,20 +9,24 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
-use super::profile_modbus::{RawModbus, RawRegisters, check_areas};
-use super::profile_transport::{RawLine, RawSerial, RawTransport, Sections, parse_transport};
+use super::profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
+use super::profile_modbus::{RawDirect, RawModbus, RawRegisters, check_areas};
+use super::profile_transport::{RawLine, RawMap, RawSerial, RawTransport, Sections, parse_transport};
 use super::transport::Transport;
 use crate::config::{At, ConfigError, Document};
 use crate::tube::MachineLimits;
 
-const SHIPPED: [(&str, &str); 5] = [
+const SHIPPED: [(&str, &str); 6] = [
     ("reference-modbus", include_str!("../../protocols/reference-modbus.toml")),
     ("reference-rtu", include_str!("../../protocols/reference-rtu.toml")),
     ("reference-serial", include_str!("../../protocols/reference-serial.toml")),
     ("reference-folder", include_str!("../../protocols/reference-folder.toml")),
+    ("ten-row", include_str!("../../protocols/ten-row.toml")),
     ("reference-rtu-over-tcp", include_str!("../../protocols/reference-rtu-over-tcp.toml")),
 ];
+
+/// Longest name of a program on machines that keep none.
+const UNKEPT_PROGRAM: usize = 32;
 
 /// Names of the profiles that come with the program.
 pub fn shipped_profiles() -> impl Iterator<Item = &'static str> {
@@ -40,6 +44,7 @@ struct RawProfile {
     unit_id: Option<At<i64>>,
     modbus: Option<RawModbus>,
     registers: Option<RawRegisters>,
+    direct: Option<RawDirect>,
     line: Option<RawLine>,
     serial: Option<RawSerial>,
     constants: RawConstants,
@@ -53,16 +58,30 @@ struct RawProfile {
 #[serde(deny_unknown_fields)]
 struct RawConstants {
     identification: At<i64>,
-    layout: At<i64>,
+    layout: Option<At<i64>>,
 }
 
 #[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct RawTable {
-    program_characters: At<i64>,
+    program_characters: Option<At<i64>>,
     length_resolution_mm: At<f64>,
     angle_resolution_deg: At<f64>,
     rotation_sign: At<i64>,
+    #[serde(default)]
+    feed: Sequence,
+    #[serde(default)]
+    rotation: Sequence,
+    columns: Option<RawColumns>,
+}
+
+/// What the machine's screen calls them.
+#[derive(Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+struct RawColumns {
+    length: At<String>,
+    rotation: At<String>,
+    angle: At<String>,
 }
 
 #[derive(Deserialize, JsonSchema)]
@@ -117,20 +136,41 @@ impl Profile {
     pub fn parse(doc: &Document) -> Result<Profile, ConfigError> {
         let raw: RawProfile = doc.parse()?;
         integer(doc, &raw.version, "version", 1..=1)?;
-        if raw.modbus.is_some() != raw.registers.is_some() {
-            let (span, allowed) =
-                (raw.transport.span(), "with both of [modbus] and [registers] or with neither");
+        if raw.registers.is_some() && raw.direct.is_some() {
+            let span = raw.transport.span();
             let found = doc.text().get(span.clone()).unwrap_or("");
-            return Err(doc.value_error(span, "transport", found, allowed));
+            return Err(doc.value_error(span, "transport", found, "with one of [registers] and [direct]"));
         }
         let sections = Sections {
             unit_id: raw.unit_id.as_ref(),
-            modbus: raw.modbus.as_ref().zip(raw.registers.as_ref()),
+            modbus: raw.modbus.as_ref(),
+            map: match (&raw.registers, &raw.direct) {
+                (Some(registers), None) => Some(RawMap::Staged(registers)),
+                (None, Some(direct)) => {
+                    let rows = integer(doc, &raw.limits.max_bends, "limits.max_bends", 1..=123)?;
+                    let coils = raw.state_bit.iter().map(|b| *b.bit.get_ref() + 1).max().unwrap_or(1);
+                    Some(RawMap::Direct(direct, rows, coils.clamp(1, 16) as u16))
+                }
+                _ => None,
+            },
             line: raw.line.as_ref(),
             serial: raw.serial.as_ref(),
         };
-        let table = parse_table(doc, &raw.table, sections.word_order())?;
+        let table = parse_table(doc, &raw.table, sections.word_order(), raw.direct.is_some())?;
         let transport = parse_transport(doc, &raw.transport, &sections)?;
+        let layout = match (&raw.constants.layout, transport.direct()) {
+            (Some(layout), None) => integer(doc, layout, "constants.layout", 0..=0xffff)? as u16,
+            (None, Some(_)) => 0,
+            (None, None) => {
+                return Err(incomplete(
+                    doc,
+                    &raw.constants.identification,
+                    "constants.identification",
+                    "layout",
+                ));
+            }
+            (Some(layout), Some(_)) => return Err(useless(doc, layout, "constants.layout")),
+        };
         let deadlines = parse_deadlines(doc, &raw.deadlines, &transport)?;
         let profile = Profile {
             name: text(doc, &raw.name, "name", 32)?,
@@ -143,7 +183,7 @@ impl Profile {
                 "constants.identification",
                 1..=u32::MAX.into(),
             )? as u32,
-            layout: integer(doc, &raw.constants.layout, "constants.layout", 0..=0xffff)? as u16,
+            layout,
             limits: parse_limits(doc, &raw.limits, &table)?,
             table,
             state_bits: parse_state_bits(doc, &raw.state_bit)?,
@@ -156,23 +196,34 @@ impl Profile {
     }
 }
 
-fn parse_table(doc: &Document, raw: &RawTable, word_order: WordOrder) -> Result<TableFormat, ConfigError> {
-    let characters = integer(doc, &raw.program_characters, "table.program_characters", 4..=64)?;
-    if characters % 4 != 0 {
-        let span = raw.program_characters.span();
-        return Err(doc.value_error(
-            span,
-            "table.program_characters",
-            characters,
-            "a multiple of 4, 4 to 64",
-        ));
-    }
+fn parse_table(
+    doc: &Document,
+    raw: &RawTable,
+    word_order: WordOrder,
+    is_direct: bool,
+) -> Result<TableFormat, ConfigError> {
+    let program_bytes = match (&raw.program_characters, is_direct) {
+        (Some(characters), false) => program_bytes(doc, characters)?,
+        (None, true) => UNKEPT_PROGRAM,
+        (None, false) => {
+            return Err(incomplete(doc, &raw.rotation_sign, "table.rotation_sign", "program_characters"));
+        }
+        (Some(characters), true) => return Err(useless(doc, characters, "table.program_characters")),
+    };
     let sign = *raw.rotation_sign.get_ref();
     if sign.abs() != 1 {
         return Err(doc.value_error(raw.rotation_sign.span(), "table.rotation_sign", sign, "1 or -1"));
     }
+    let columns = match &raw.columns {
+        None => ["length", "rotation", "angle"].map(str::to_owned),
+        Some(names) => [
+            text(doc, &names.length, "table.columns.length", 12)?,
+            text(doc, &names.rotation, "table.columns.rotation", 12)?,
+            text(doc, &names.angle, "table.columns.angle", 12)?,
+        ],
+    };
     Ok(TableFormat {
-        program_bytes: characters as usize,
+        program_bytes,
         word_order,
         length_resolution_mm: doc.in_range(
             &raw.length_resolution_mm,
@@ -185,6 +236,9 @@ fn parse_table(doc: &Document, raw: &RawTable, word_order: WordOrder) -> Result<
             1e-5..=1.0,
         )?,
         rotation_reversed: sign == -1,
+        feed: raw.feed,
+        rotation: raw.rotation,
+        columns,
     })
 }
 
@@ -197,6 +251,25 @@ fn parse_state_bits(doc: &Document, raw: &[RawStateBit]) -> Result<Vec<StateBit>
         }
     }
     raw.iter().map(|one| parse_state_bit(doc, one)).collect()
+}
+
+fn program_bytes(doc: &Document, characters: &At<i64>) -> Result<usize, ConfigError> {
+    let key = "table.program_characters";
+    let found = integer(doc, characters, key, 4..=64)?;
+    if found % 4 != 0 {
+        return Err(doc.value_error(characters.span(), key, found, "a multiple of 4, 4 to 64"));
+    }
+    Ok(found as usize)
+}
+
+/// A value that needs another beside it.
+fn incomplete(doc: &Document, value: &At<i64>, key: &str, beside: &str) -> ConfigError {
+    doc.value_error(value.span(), key, value.get_ref(), format!("with {beside} beside it"))
+}
+
+/// A value that a machine whose rows are written directly has no use for.
+fn useless(doc: &Document, value: &At<i64>, key: &str) -> ConfigError {
+    doc.value_error(value.span(), key, value.get_ref(), "nothing: with [direct] the machine keeps none")
 }
 
 fn parse_state_bit(doc: &Document, raw: &RawStateBit) -> Result<StateBit, ConfigError> {
@@ -233,7 +306,7 @@ fn parse_deadlines(
         Ok(integer(doc, value, &format!("deadlines.{key}"), 1..=max)? as u64)
     };
     let request = ms(&raw.request_ms, "request_ms", 60_000)?;
-    let transfer = match (&raw.transfer_ms, transport.modbus()) {
+    let transfer = match (&raw.transfer_ms, transport.device()) {
         (None, Some(_)) => request,
         (Some(transfer), None) => ms(transfer, "transfer_ms", 600_000)?,
         (Some(wrong), Some(_)) => {
@@ -356,11 +429,8 @@ mod tests {
             complaint("first_length_mm = 10.0", "first_length_mm = 6000.1").contains("allowed is 0 to 6000")
         );
         assert!(complaint("min_between_mm = 0.0", "min_between_mm = 7e3").contains("allowed is 0 to 6000"));
-        let serial = include_str!("../../protocols/reference-serial.toml");
-        let half = format!(
-            "{serial}\n[modbus]\nword_order = \"dcba\"\nmax_read_registers = 4\nmax_write_registers = 4"
-        );
-        assert!(parse(&half).unwrap_err().contains("both of [modbus] and [registers] or with neither"));
+        let direct = "[direct]\nidentification = 1\nstate_coils = 2\nlength = 3\nrotation = 4\nangle = 5\n\n[constants]";
+        assert!(complaint("[constants]", direct).contains("with one of [registers] and [direct]"));
     }
 
     #[test]

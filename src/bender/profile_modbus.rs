@@ -6,6 +6,7 @@
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::direct::DirectMap;
 use super::profile::{Profile, WordOrder};
 use super::profile_file::integer;
 use super::registers::{ModbusMap, Registers};
@@ -45,6 +46,48 @@ pub struct RawRegisters {
     commit: At<i64>,
     staging: At<i64>,
     active: At<i64>,
+}
+
+/// Where a machine without a staging area keeps its rows.
+#[derive(Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RawDirect {
+    /// u16 register that must hold `constants.identification`.
+    identification: At<i64>,
+    /// First coil of the state.
+    state_coils: At<i64>,
+    /// First register of each column.
+    length: At<i64>,
+    rotation: At<i64>,
+    angle: At<i64>,
+}
+
+/// Such a machine; `rows` and `coils`: how many it has.
+pub fn parse_direct(
+    doc: &Document,
+    unit_id: &At<i64>,
+    modbus: &RawModbus,
+    raw: &RawDirect,
+    rows: i64,
+    coils: u16,
+) -> Result<DirectMap, ConfigError> {
+    let column = |value: &At<i64>, key: &str| -> Result<u16, ConfigError> {
+        Ok(integer(doc, value, &format!("direct.{key}"), 0..=0x10000 - rows)? as u16)
+    };
+    // A column that is written in two requests could be left half old, half new.
+    integer(doc, &modbus.max_write_registers, "modbus.max_write_registers", rows..=123)?;
+    integer(doc, &modbus.max_read_registers, "modbus.max_read_registers", rows..=125)?;
+    Ok(DirectMap {
+        unit_id: integer(doc, unit_id, "unit_id", 0..=255)? as u8,
+        identification: integer(doc, &raw.identification, "direct.identification", 0..=0xffff)? as u16,
+        state_coils: integer(doc, &raw.state_coils, "direct.state_coils", 0..=0x10000 - 16)? as u16,
+        coils,
+        columns: [
+            column(&raw.length, "length")?,
+            column(&raw.rotation, "rotation")?,
+            column(&raw.angle, "angle")?,
+        ],
+    })
 }
 
 impl From<RawWordOrder> for WordOrder {
@@ -194,5 +237,27 @@ mod tests {
         assert!(parse(&TEXT.replace("active = 2000", "active = 65276")).is_ok());
         assert!(complaint("commit = 32", "commit = 121").contains("one read of 124 registers"));
         assert!(parse(&TEXT.replace("commit = 32", "commit = 120")).is_ok());
+    }
+
+    #[test]
+    fn a_map_without_a_staging_area_has_its_own_section_and_none_of_the_others() {
+        const TEN: &str = include_str!("../../protocols/ten-row.toml");
+        let complaint = |from: &str, to: &str| {
+            assert!(TEN.contains(from), "{from:?}");
+            parse(&TEN.replacen(from, to, 1)).unwrap_err()
+        };
+        assert!(parse(TEN).is_ok());
+        let text = complaint("max_write_registers = 123", "max_write_registers = 9");
+        assert!(text.contains("max_write_registers = 9, allowed is 10 to 123"), "{text}");
+        let text = complaint("[direct]", "[registers]");
+        assert!(text.contains("unknown field"), "{text}");
+        let text = complaint("length = 3523", "length = 65527");
+        assert!(text.contains("direct.length = 65527, allowed is 0 to 65526"), "{text}");
+        let text = complaint("identification = 60", "identification = 60\nlayout = 1");
+        assert!(text.contains("constants.layout = 1, allowed is nothing"), "{text}");
+        let text = complaint("rotation_sign", "program_characters = 32\nrotation_sign");
+        assert!(text.contains("table.program_characters = 32, allowed is nothing"), "{text}");
+        let text = parse(&TEXT.replacen("layout = 1", "", 1)).unwrap_err();
+        assert!(text.contains("with layout beside it"), "{text}");
     }
 }

@@ -9,8 +9,8 @@ use serde::Deserialize;
 
 use super::profile::WordOrder;
 use super::profile_file::integer;
-use super::profile_modbus::{RawModbus, RawRegisters, parse_modbus};
-use super::transport::{LineSettings, Parity, SerialSettings, Transport};
+use super::profile_modbus::{RawDirect, RawModbus, RawRegisters, parse_direct, parse_modbus};
+use super::transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 use crate::config::{At, ConfigError, Document};
 
 /// The links that exist.
@@ -32,9 +32,9 @@ impl RawTransport {
     /// Whether a part of the file belongs to this transport.
     fn needs(self, section: &str) -> bool {
         let needed: &[&str] = match self {
-            RawTransport::Tcp => &["unit_id", "[modbus], [registers]"],
-            RawTransport::Rtu => &["unit_id", "[modbus], [registers]", "[line]", "[serial]"],
-            RawTransport::RtuOverTcp => &["unit_id", "[modbus], [registers]", "[line]"],
+            RawTransport::Tcp => &["unit_id", "[modbus]", "[registers] or [direct]"],
+            RawTransport::Rtu => &["unit_id", "[modbus]", "[registers] or [direct]", "[line]", "[serial]"],
+            RawTransport::RtuOverTcp => &["unit_id", "[modbus]", "[registers] or [direct]", "[line]"],
             RawTransport::SerialTable => &["unit_id", "[line]", "[serial]"],
             RawTransport::Folder => &["unit_id"],
         };
@@ -62,24 +62,36 @@ pub struct RawSerial {
 pub struct Sections<'a> {
     /// Who is asked on a line that has several.
     pub unit_id: Option<&'a At<i64>>,
-    /// `[modbus]` and `[registers]`.
-    pub modbus: Option<(&'a RawModbus, &'a RawRegisters)>,
+    /// `[modbus]`.
+    pub modbus: Option<&'a RawModbus>,
+    /// `[registers]` or `[direct]`.
+    pub map: Option<RawMap<'a>>,
     /// `[line]`.
     pub line: Option<&'a RawLine>,
     /// `[serial]`.
     pub serial: Option<&'a RawSerial>,
 }
 
+/// Where a Modbus device keeps its values.
+#[derive(Clone, Copy)]
+pub enum RawMap<'a> {
+    /// `[registers]`.
+    Staged(&'a RawRegisters),
+    /// `[direct]`, how many rows, how many coils of state.
+    Direct(&'a RawDirect, i64, u16),
+}
+
 impl Sections<'_> {
     /// Of 32-bit values; where the file says nothing, the highest byte first.
     pub fn word_order(&self) -> WordOrder {
-        self.modbus.map_or(WordOrder::Abcd, |(modbus, _)| modbus.word_order.into())
+        self.modbus.map_or(WordOrder::Abcd, |modbus| modbus.word_order.into())
     }
 
-    fn all(&self) -> [(&'static str, bool); 4] {
+    fn all(&self) -> [(&'static str, bool); 5] {
         [
             ("unit_id", self.unit_id.is_some()),
-            ("[modbus], [registers]", self.modbus.is_some()),
+            ("[modbus]", self.modbus.is_some()),
+            ("[registers] or [direct]", self.map.is_some()),
             ("[line]", self.line.is_some()),
             ("[serial]", self.serial.is_some()),
         ]
@@ -92,30 +104,54 @@ pub fn parse_transport(
     transport: &At<RawTransport>,
     sections: &Sections<'_>,
 ) -> Result<Transport, ConfigError> {
-    let map = |unit_id, (modbus, registers)| parse_modbus(doc, unit_id, modbus, registers);
+    let device = |unit_id, modbus, map: &RawMap<'_>| {
+        Ok(match map {
+            RawMap::Staged(registers) => Device::Staged(parse_modbus(doc, unit_id, modbus, registers)?),
+            RawMap::Direct(direct, rows, coils) => {
+                Device::Direct(parse_direct(doc, unit_id, modbus, direct, *rows, *coils)?)
+            }
+        })
+    };
     Ok(match (transport.get_ref(), sections) {
         (
             RawTransport::Tcp,
-            Sections { unit_id: Some(unit), modbus: Some(modbus), line: None, serial: None },
-        ) => Transport::ModbusTcp(map(unit, *modbus)?),
+            Sections { unit_id: Some(unit), modbus: Some(modbus), map: Some(map), line: None, serial: None },
+        ) => Transport::ModbusTcp(device(unit, modbus, map)?),
         (
             RawTransport::Rtu,
-            Sections { unit_id: Some(unit), modbus: Some(modbus), line: Some(line), serial: Some(serial) },
-        ) => Transport::ModbusRtu(map(unit, *modbus)?, parse_line(doc, line)?, parse_serial(doc, serial)?),
+            Sections {
+                unit_id: Some(unit),
+                modbus: Some(modbus),
+                map: Some(map),
+                line: Some(line),
+                serial: Some(serial),
+            },
+        ) => Transport::ModbusRtu(
+            device(unit, modbus, map)?,
+            parse_line(doc, line)?,
+            parse_serial(doc, serial)?,
+        ),
         (
             RawTransport::RtuOverTcp,
-            Sections { unit_id: Some(unit), modbus: Some(modbus), line: Some(line), serial: None },
-        ) => Transport::ModbusRtuOverTcp(map(unit, *modbus)?, parse_line(doc, line)?),
+            Sections {
+                unit_id: Some(unit),
+                modbus: Some(modbus),
+                map: Some(map),
+                line: Some(line),
+                serial: None,
+            },
+        ) => Transport::ModbusRtuOverTcp(device(unit, modbus, map)?, parse_line(doc, line)?),
         (
             RawTransport::SerialTable,
-            Sections { unit_id: Some(unit), modbus: None, line: Some(line), serial: Some(serial) },
+            Sections { unit_id: Some(unit), modbus: None, map: None, line: Some(line), serial: Some(serial) },
         ) => {
             let unit = integer(doc, unit, "unit_id", 0..=255)? as u8;
             Transport::SerialTable(unit, parse_line(doc, line)?, parse_serial(doc, serial)?)
         }
-        (RawTransport::Folder, Sections { unit_id: Some(unit), modbus: None, line: None, serial: None }) => {
-            Transport::Folder(integer(doc, unit, "unit_id", 0..=9999)? as u16)
-        }
+        (
+            RawTransport::Folder,
+            Sections { unit_id: Some(unit), modbus: None, map: None, line: None, serial: None },
+        ) => Transport::Folder(integer(doc, unit, "unit_id", 0..=9999)? as u16),
         (kind, _) => {
             let name = doc.text().get(transport.span()).unwrap_or("");
             let (with, without): (Vec<_>, Vec<_>) = {

@@ -7,6 +7,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::direct::DirectMap;
 use super::registers::ModbusMap;
 use crate::config::{HOST_PORT, is_device, is_host_port};
 
@@ -14,11 +15,11 @@ use crate::config::{HOST_PORT, is_device, is_host_port};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Transport {
     /// Modbus TCP. A stream: dropped on any doubt.
-    ModbusTcp(ModbusMap),
+    ModbusTcp(Device),
     /// Modbus RTU on a serial port of this computer.
-    ModbusRtu(ModbusMap, LineSettings, SerialSettings),
+    ModbusRtu(Device, LineSettings, SerialSettings),
     /// Modbus RTU's frames over TCP, as device servers for serial lines pass them on.
-    ModbusRtuOverTcp(ModbusMap, LineSettings),
+    ModbusRtuOverTcp(Device, LineSettings),
     /// The serial table protocol on a serial port, with the machine of this number.
     SerialTable(u8, LineSettings, SerialSettings),
     /// Files in a folder that both reach, for the bender of this number.
@@ -64,13 +65,29 @@ impl Transport {
         }
     }
 
-    /// The device's map, where it speaks Modbus.
-    pub fn modbus(&self) -> Option<&ModbusMap> {
+    /// What is behind Modbus, where that is spoken.
+    pub fn device(&self) -> Option<&Device> {
         match self {
-            Transport::ModbusTcp(map)
-            | Transport::ModbusRtu(map, ..)
-            | Transport::ModbusRtuOverTcp(map, _) => Some(map),
+            Transport::ModbusTcp(device)
+            | Transport::ModbusRtu(device, ..)
+            | Transport::ModbusRtuOverTcp(device, _) => Some(device),
             Transport::SerialTable(..) | Transport::Folder(_) => None,
+        }
+    }
+
+    /// The map of a machine with a staging area in registers.
+    pub fn modbus(&self) -> Option<&ModbusMap> {
+        match self.device()? {
+            Device::Staged(map) => Some(map),
+            Device::Direct(_) => None,
+        }
+    }
+
+    /// The map of a machine whose rows are written directly.
+    pub fn direct(&self) -> Option<&DirectMap> {
+        match self.device()? {
+            Device::Direct(map) => Some(map),
+            Device::Staged(_) => None,
         }
     }
 
@@ -81,6 +98,15 @@ impl Transport {
             Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) | Transport::Folder(_) => None,
         }
     }
+}
+
+/// What is behind Modbus.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Device {
+    /// A machine with staging area, commit and status.
+    Staged(ModbusMap),
+    /// One whose rows are in force as soon as they are written.
+    Direct(DirectMap),
 }
 
 /// A line: it cannot be closed, so what is still under way arrives.

@@ -181,9 +181,10 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
     async fn perform(&mut self, action: Action) -> Result<(), ArmError> {
         match action {
             Action::ReadMachine(ticket) => self.ask(Ask::Read(ticket)),
-            Action::Deliver(ticket, table, expected) => {
+            Action::Deliver(ticket, table, expected, operation) => {
                 let program = self.identity.program.clone();
-                self.ask(Ask::Deliver(ticket, Job { program, table, expected_active: Some(expected) }));
+                let job = Job { program, table, expected_active: Some(expected), operation, approved: false };
+                self.ask(Ask::Deliver(ticket, job));
             }
             Action::Measure(ticket, scan) => self.hand_out(move |craft| measured(craft, ticket, &scan)),
             Action::Decide(ticket) => {

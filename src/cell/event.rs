@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::arm::ScanFile;
-use crate::bender::TableId;
+use crate::bender::{Operation, TableId};
 use crate::correct::Answer;
 use crate::inspect::Inspection;
 use crate::tube::{CommandTable, MeasuredTube};
@@ -92,7 +92,7 @@ pub enum Action {
     /// Decide the next step from [`Cell::history`](super::Cell::history).
     Decide(Ticket),
     /// Deliver this table over the one in force, if that is still this one.
-    Deliver(Ticket, CommandTable, TableId),
+    Deliver(Ticket, CommandTable, TableId, Operation),
     /// The scan was used: file it as done.
     FileDone(ScanFile),
     /// The scan was not used: file it as failed with this reason.

@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 
 use crate::bender::{Intent, IntentLog, Job, LogError, Outcome, TableId};
 use crate::journal::{Journal, JournalError, Record};
+use crate::tube::CommandTable;
 
 /// A journal in the shape that a delivery wants.
 #[derive(Debug)]
@@ -45,22 +46,42 @@ impl<'a> JournalledIntents<'a> {
 
     /// New and old table of the last intent, if nothing decided it since.
     fn open_intent(&self) -> Result<Option<(TableId, TableId)>, JournalError> {
-        let (mut open, mut after) = (None, 0);
+        let mut open = None;
+        self.each_record(|kind, content| match kind {
+            "intent" => open = Some((id_of(&content["intent"]["new"]), id_of(&content["intent"]["old"]))),
+            "outcome" if content["result"]["outcome"] != "unknown" => open = None,
+            "resolved" => open = None,
+            _ => {}
+        })?;
+        Ok(open)
+    }
+
+    /// The rows of the table that was put in force last for this program; none where there never was one.
+    pub fn last_applied(&self, program: &str) -> Result<Option<CommandTable>, JournalError> {
+        let (mut intent, mut applied) = (Value::Null, Value::Null);
+        self.each_record(|kind, content| match kind {
+            "intent" => intent = content["intent"].clone(),
+            "outcome" | "resolved"
+                if content["result"]["outcome"] == "applied" && content["committed"] == intent["new"] =>
+            {
+                applied = intent.clone();
+            }
+            _ => {}
+        })?;
+        let is_meant = applied["program"] == program;
+        Ok(is_meant.then(|| serde_json::from_value(applied["table"].clone()).ok()).flatten())
+    }
+
+    /// This machine's records, in order.
+    fn each_record(&self, mut act: impl FnMut(&str, &Value)) -> Result<(), JournalError> {
+        let mut after = 0;
         loop {
             let records = self.journal.list(after, 1000)?;
-            let Some(last) = records.last() else { return Ok(open) };
+            let Some(last) = records.last() else { return Ok(()) };
             after = last.seq;
             for record in records {
-                let Ok(content) = serde_json::from_str::<Value>(&record.content) else { continue };
-                if content["machine"] != self.machine.as_str() {
-                    continue;
-                }
-                match record.kind.as_str() {
-                    "intent" => {
-                        open = Some((id_of(&content["intent"]["new"]), id_of(&content["intent"]["old"])))
-                    }
-                    "outcome" if content["result"]["outcome"] != "unknown" => open = None,
-                    "resolved" => open = None,
+                match serde_json::from_str::<Value>(&record.content) {
+                    Ok(content) if content["machine"] == self.machine.as_str() => act(&record.kind, &content),
                     _ => {}
                 }
             }
@@ -102,7 +123,7 @@ fn id_of(value: &Value) -> TableId {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tube::CommandTable;
+    use crate::bender::Operation;
 
     const OLD: TableId = TableId { revision: 7, crc: 1 };
     const NEW: TableId = TableId { revision: 8, crc: 2 };
@@ -118,7 +139,13 @@ mod tests {
     }
 
     fn job() -> Job {
-        Job { program: "P1".into(), table: CommandTable::default(), expected_active: None }
+        Job {
+            program: "P1".into(),
+            table: CommandTable::default(),
+            expected_active: None,
+            operation: Operation::New,
+            approved: false,
+        }
     }
 
     fn with_log(test: impl FnOnce(&mut JournalledIntents)) {
@@ -151,6 +178,29 @@ mod tests {
             log.intent(&intent()).unwrap();
             log.outcome(&job(), Some(&intent()), &Outcome::Unknown { why: "w".into() }).unwrap();
             assert_eq!(log.resolve(NEW).unwrap(), Some(Outcome::Applied(NEW)));
+        });
+    }
+
+    #[test]
+    fn what_was_put_in_force_last_is_found_also_when_only_a_later_look_said_so() {
+        with_log(|log| {
+            assert_eq!(log.last_applied("P1").unwrap(), None);
+            let of = |last_length_mm| Intent {
+                table: CommandTable { last_length_mm, ..CommandTable::default() },
+                ..intent()
+            };
+            log.intent(&of(1.0)).unwrap();
+            assert_eq!(log.last_applied("P1").unwrap(), None, "nobody knows yet");
+            log.outcome(&job(), Some(&of(1.0)), &Outcome::Applied(NEW)).unwrap();
+            let found = |log: &JournalledIntents| log.last_applied("P1").unwrap().unwrap().last_length_mm;
+            assert_eq!(found(log), 1.0);
+            log.intent(&of(2.0)).unwrap();
+            log.outcome(&job(), Some(&of(2.0)), &Outcome::NotApplied { why: "w".into() }).unwrap();
+            assert_eq!(found(log), 1.0);
+            log.intent(&of(3.0)).unwrap();
+            log.resolve(NEW).unwrap();
+            assert_eq!(found(log), 3.0);
+            assert_eq!(log.last_applied("P2").unwrap(), None, "another program's");
         });
     }
 

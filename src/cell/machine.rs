@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 use crate::arm::ScanFile;
-use crate::bender::TableId;
+use crate::bender::{Operation, TableId};
 use crate::config::Mode;
 use crate::correct::Verdict;
 use crate::tube::{CommandTable, MeasuredTube};
@@ -422,8 +422,14 @@ impl Cell {
     fn deliver(&mut self, table: CommandTable) -> Vec<Action> {
         // Only a machine that was read leads here; without a table read there is none to be replaced.
         let expected = self.in_force.as_ref().map_or(TableId::default(), |f| f.id);
+        let operation = match &self.in_force {
+            Some(InForce { id, table: last, .. }) if self.ours == Some(*id) => {
+                Operation::Correct { last: last.clone() }
+            }
+            _ => Operation::New,
+        };
         self.enter(State::Delivering(table.clone()));
-        vec![Action::Deliver(self.next_ticket(), table, expected)]
+        vec![Action::Deliver(self.next_ticket(), table, expected, operation)]
     }
 
     fn delivered(&mut self, table: CommandTable, outcome: Delivered) -> Vec<Action> {

@@ -9,7 +9,7 @@ use super::driver::{Craft, Identity};
 use super::event::Dwell;
 use super::places;
 use crate::arm::FolderSettings;
-use crate::bender::{Job, Profile, prepare};
+use crate::bender::{Job, Operation, Profile, prepare};
 use crate::cloud::Unit;
 use crate::config::{CellConfig, ConfigError, DaemonConfig, Materials, ScanUnit, load_part};
 use crate::correct::Verdict;
@@ -138,8 +138,13 @@ impl Setup {
     fn check_first_piece(&self) -> Result<(), SetupError> {
         let first = self.chain.decide(&[]).answer;
         let why = if first.verdict == Verdict::FirstPiece {
-            let job =
-                Job { program: self.identity.program.clone(), table: first.commanded, expected_active: None };
+            let job = Job {
+                program: self.identity.program.clone(),
+                table: first.commanded,
+                expected_active: None,
+                operation: Operation::New,
+                approved: true, // of a machine that is not asked
+            };
             match prepare(&self.profile, &job) {
                 Ok(_) => return Ok(()),
                 Err(reasons) => reasons.into_iter().map(|r| r.text).collect::<Vec<_>>(),

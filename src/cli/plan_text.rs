@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use crate::bender::plan::{self, Request};
 use crate::bender::{
-    ModbusMap, Parity, Profile, SerialSettings, Transport, WordOrder, fields, payload_bytes,
+    Device, DirectMap, ModbusMap, Parity, Profile, Sequence, SerialSettings, Transport, WordOrder, fields,
+    payload_bytes,
 };
 
 /// All of it.
@@ -45,10 +46,27 @@ fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
     for bit in &profile.state_bits {
         writeln!(out, "  bit {:<2} {:<20} {}", bit.bit, bit.name, if bit.must_be { "on" } else { "off" })?;
     }
-    match profile.transport.modbus() {
-        Some(map) => write_requests(out, profile, map),
+    match profile.transport.device() {
+        Some(Device::Staged(map)) => write_requests(out, profile, map),
+        Some(Device::Direct(map)) => write_columns(out, profile, map),
         None => Ok(()),
     }
+}
+
+fn write_columns(out: &mut String, profile: &Profile, map: &DirectMap) -> std::fmt::Result {
+    let rows = profile.limits.max_bends as u16;
+    writeln!(out, "\nrows, in force as soon as they are written: every write needs the operator's approval")?;
+    writeln!(out, "                           from 0        as 4xxxx")?;
+    let one = |address, registers| Request { writes: false, address, registers };
+    writeln!(out, "  {:<22}   {}", "identification", registers(&one(map.identification, 1)))?;
+    for (name, address) in profile.table.columns.iter().zip(map.columns) {
+        writeln!(out, "  {name:<22}   {}", registers(&one(address, rows)))?;
+    }
+    writeln!(out, "  {:<22}   coils {} to {}", "state", map.state_coils, map.state_coils + map.coils - 1)?;
+    let sequence = |cumulative| if cumulative { "all from the first on" } else { "each from the one before" };
+    let table = &profile.table;
+    writeln!(out, "  {} {}", table.columns[0], sequence(table.feed == Sequence::Cumulative))?;
+    writeln!(out, "  {} {}", table.columns[1], sequence(table.rotation == Sequence::Cumulative))
 }
 
 fn write_requests(out: &mut String, profile: &Profile, map: &ModbusMap) -> std::fmt::Result {
@@ -75,13 +93,22 @@ fn registers(request: &Request) -> String {
 
 fn transport(profile: &Profile) -> String {
     match &profile.transport {
-        Transport::ModbusTcp(map) => format!("Modbus TCP, unit {}", map.unit_id),
-        Transport::ModbusRtuOverTcp(map, _) => format!("Modbus RTU over TCP, unit {}", map.unit_id),
-        Transport::ModbusRtu(map, _, port) => format!("Modbus RTU, {}, unit {}", serial(port), map.unit_id),
+        Transport::ModbusTcp(device) => format!("Modbus TCP, unit {}", unit(device)),
+        Transport::ModbusRtuOverTcp(device, _) => format!("Modbus RTU over TCP, unit {}", unit(device)),
+        Transport::ModbusRtu(device, _, port) => {
+            format!("Modbus RTU, {}, unit {}", serial(port), unit(device))
+        }
         Transport::Folder(number) => format!("shared folder, bender {number}"),
         Transport::SerialTable(unit, _, port) => {
             format!("serial table protocol, {}, unit {unit}", serial(port))
         }
+    }
+}
+
+fn unit(device: &Device) -> u8 {
+    match device {
+        Device::Staged(map) => map.unit_id,
+        Device::Direct(map) => map.unit_id,
     }
 }
 

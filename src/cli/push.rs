@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{Outcome as Exit, push_text, say};
 use crate::bender::{
-    ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Outcome, Profile, Reason, TableId,
-    check_program, deliver, gate, prepare,
+    ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Operation, Outcome, Profile, Reason,
+    TableId, check_program, deliver, gate, objections, prepare,
 };
 use crate::cell::JournalledIntents;
 use crate::config::{Table, read_table};
@@ -31,6 +31,14 @@ pub struct Args {
     /// The program that must be loaded [default: the table's file name without its ending].
     #[arg(long, value_name = "NAME")]
     program: Option<String>,
+    /// Corrects the table that was committed last for this program: the machine must still hold it, row for row, and no row is added
+    /// or removed. Without it the rows are made anew, whatever the machine holds.
+    #[arg(long)]
+    correct: bool,
+    /// The operator has seen that nothing is bent and the right program is loaded: needed for machines without a staging area, whose
+    /// rows are in force as soon as they are written.
+    #[arg(long)]
+    approve: bool,
     /// Connects and reads, says what would be done, writes nothing.
     #[arg(long)]
     dry_run: bool,
@@ -112,12 +120,23 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         report.result = Ending::Delivered(Outcome::Rejected { reasons: refusal });
         return finish(args, &report);
     }
+    let mut operation = Operation::New;
+    if args.correct {
+        let mut journal = open_journal(args.journal.as_deref())?;
+        let Some(last) = JournalledIntents::new(&mut journal, &endpoint).last_applied(&program)? else {
+            bail!(
+                "--correct: nothing that was committed to {endpoint} for program {program:?} is in {}; leave it out to make the rows anew",
+                journal.file()
+            );
+        };
+        operation = Operation::Correct { last };
+    }
     let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
     report.journal = journal.as_ref().map(|j| j.file().to_owned());
     if !args.json {
         report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
     }
-    let job = Job { program, table, expected_active: None };
+    let job = Job { program, table, expected_active: None, operation, approved: args.approve };
     let mut link = Link::new(profile, endpoint)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
@@ -157,7 +176,9 @@ async fn push(
         report.active = Some(active_id);
         if let Ok(prepared) = prepare(link.profile(), &job) {
             let same = active_id.revision != 0 && active_id.crc == prepared.crc;
-            let revision = active_id.revision.wrapping_add(u32::from(!same));
+            let revision = active_id
+                .revision
+                .wrapping_add(u32::from(!same && link.profile().transport.direct().is_none()));
             report.new = Some(TableId { revision, crc: prepared.crc });
         }
         if !args.json {
@@ -198,7 +219,10 @@ async fn look(link: &mut Link, job: &Job) -> Result<ActiveTable, Outcome> {
 /// What a delivery would meet: an objection, "already active", or nothing.
 fn rehearse(profile: &Profile, job: &Job, active: &ActiveTable) -> Result<Option<Outcome>, Outcome> {
     let prepared = prepare(profile, job).map_err(|reasons| Outcome::Rejected { reasons })?;
-    let reasons: Vec<Reason> = gate(profile, &prepared, &active.status);
+    let mut reasons: Vec<Reason> = gate(profile, &prepared, &active.status);
+    if let Operation::Correct { last } = &job.operation {
+        reasons.extend(objections(profile, &job.program, last, &job.table, active));
+    }
     if active.status.active.revision != 0 && active.status.active.crc == prepared.crc {
         return Ok(Some(Outcome::AlreadyActive(active.status.active)));
     }

@@ -38,6 +38,13 @@ pub enum Request {
         /// How many.
         count: u16,
     },
+    /// Function 1.
+    ReadCoils {
+        /// First coil.
+        address: u16,
+        /// How many.
+        count: u16,
+    },
     /// Function 16.
     Write {
         /// First register.
@@ -55,6 +62,7 @@ pub enum Request {
 impl Request {
     fn function(&self) -> u8 {
         match self {
+            Request::ReadCoils { .. } => 1,
             Request::Read { .. } => 3,
             Request::Write { .. } => 16,
             Request::Other { function } => *function,
@@ -67,6 +75,8 @@ impl Request {
 pub enum Answer {
     /// Registers that were read.
     Words(Vec<u16>),
+    /// Coils that were read.
+    Coils(Vec<bool>),
     /// A write was done.
     Written,
     /// An exception's number.
@@ -136,7 +146,7 @@ impl Listener {
     /// Length of the frame that begins here, as soon as that is known.
     fn rtu_length(&self) -> Option<usize> {
         match self.buffer.get(1)? {
-            3 => Some(8),
+            1 | 3 => Some(8),
             16 => self.buffer.get(6).map(|bytes| 9 + usize::from(*bytes)),
             // Unknown functions end with the silence; up to then nobody can tell.
             _ => (self.buffer.len() >= 4).then(|| self.buffer.len().min(LONGEST)),
@@ -159,7 +169,8 @@ fn parse(transaction: u16, body: &[u8]) -> Option<Heard> {
     let word = |at: usize| Some(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
     let request = match *body.get(1)? {
         // What has another length than its function or its counts say is not the request that it seems to be.
-        3 if body.len() != 6 => return None,
+        1 | 3 if body.len() != 6 => return None,
+        1 => Request::ReadCoils { address: word(2)?, count: word(4)? },
         3 => Request::Read { address: word(2)?, count: word(4)? },
         16 => {
             let bytes = body.get(7..)?;
@@ -181,6 +192,13 @@ pub fn encode(framing: Framing, heard: &Heard, answer: &Answer) -> Vec<u8> {
         (Answer::Words(words), _) => {
             out.extend([function, (2 * words.len()) as u8]);
             out.extend(words.iter().flat_map(|word| word.to_be_bytes()));
+        }
+        (Answer::Coils(coils), _) => {
+            let byte =
+                |bits: &[bool]| bits.iter().enumerate().map(|(i, bit)| u8::from(*bit) << i).sum::<u8>();
+            let bytes: Vec<u8> = coils.chunks(8).map(byte).collect();
+            out.extend([function, bytes.len() as u8]);
+            out.extend(bytes);
         }
         (Answer::Written, Request::Write { address, words }) => {
             out.push(function);

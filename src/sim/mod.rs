@@ -2,6 +2,7 @@
 
 pub mod bender;
 pub mod bender_server;
+pub mod direct_registers;
 pub mod door;
 pub mod faults;
 pub mod folder_station;

@@ -36,6 +36,9 @@ impl ModbusStation {
             Request::Read { address, count } => {
                 Some(controller.model.read(*address, *count).map_or_else(refused, Answer::Words))
             }
+            Request::ReadCoils { address, count } => {
+                Some(controller.model.read_coils(*address, *count).map_or_else(refused, Answer::Coils))
+            }
             Request::Write { address, words } => write(*address, words, controller),
             Request::Other { .. } => Some(Answer::Exception(NO_SUCH_FUNCTION)),
         }
@@ -43,7 +46,7 @@ impl ModbusStation {
 }
 
 fn write(address: u16, words: &[u16], controller: &mut Controller<'_>) -> Option<Answer> {
-    if address == controller.model.commit_address() {
+    if Some(address) == controller.model.commit_address() {
         return match controller.model.commit_of(words) {
             Ok(id) => controller.write_commit(id).then_some(Answer::Written),
             Err(refusal) => Some(refused(refusal)),

@@ -1,7 +1,7 @@
 //! The simulated bender as a Modbus device: what it keeps, as registers.
 
 use super::bender::MachineModel;
-use crate::bender::{Field, ModbusMap, TableId, fields, status_span};
+use crate::bender::{Device, Field, ModbusMap, TableId, fields, status_span};
 
 /// Why a request is refused, as Modbus names it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,18 +21,29 @@ impl MachineModel {
         self.profile.transport.modbus()
     }
 
+    fn is_direct(&self) -> bool {
+        self.profile.transport.direct().is_some()
+    }
+
     /// The unit that it answers for.
     pub fn unit_id(&self) -> u8 {
-        self.map().map_or(0, |map| map.unit_id)
+        match self.profile.transport.device() {
+            Some(Device::Staged(map)) => map.unit_id,
+            Some(Device::Direct(map)) => map.unit_id,
+            None => 0,
+        }
     }
 
     /// Where a commit is written.
-    pub fn commit_address(&self) -> u16 {
-        self.map().map_or(0, |map| map.registers.commit)
+    pub fn commit_address(&self) -> Option<u16> {
+        self.map().map(|map| map.registers.commit)
     }
 
     /// Reads registers.
     pub fn read(&self, address: u16, count: u16) -> Result<Vec<u16>, Refusal> {
+        if self.is_direct() {
+            return self.read_direct(address, count);
+        }
         let map = self.map().ok_or(Refusal::Address)?;
         if count == 0 || count > 125 {
             return Err(Refusal::Value);
@@ -48,6 +59,9 @@ impl MachineModel {
 
     /// Writes registers: the staging area, or the whole commit word in one request.
     pub fn write(&mut self, address: u16, words: &[u16]) -> Result<(), Refusal> {
+        if self.is_direct() {
+            return self.write_direct(address, words);
+        }
         let (staging, commit) =
             self.map().map(|m| (m.registers.staging, m.registers.commit)).ok_or(Refusal::Address)?;
         if words.is_empty() || words.len() > 123 {

@@ -15,8 +15,8 @@ use tokio::sync::mpsc;
 
 use super::TrialError;
 use crate::bender::{
-    Bender as _, Intent, IntentLog, Job, Link, LogError, Outcome, Profile, TableId, Transport, Wire, crc_of,
-    deliver, encode_payload,
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, TableId, Transport,
+    Wire, crc_of, deliver, encode_payload,
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
@@ -138,8 +138,16 @@ pub async fn run(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let bends = rng.random_range(1..=profile.limits.max_bends);
     let encode = |table: &CommandTable| encode_payload(profile, PROGRAM, table).unwrap_or_default();
-    let old = encode(&table(&mut rng, bends));
-    let job = Job { program: PROGRAM.into(), table: table(&mut rng, bends), expected_active: None };
+    let last = table(&mut rng, bends);
+    let old = encode(&last);
+    let operation = if seed % 2 == 0 { Operation::Correct { last } } else { Operation::New };
+    let job = Job {
+        program: PROGRAM.into(),
+        table: table(&mut rng, bends),
+        expected_active: None,
+        operation,
+        approved: false,
+    };
     let new = encode(&job.table);
     let edited = encode(&table(&mut rng, bends));
 
