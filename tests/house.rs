@@ -185,7 +185,7 @@ fn the_picture_says_what_the_table_says() {
 
 #[test]
 fn every_file_says_what_it_is() {
-    for folder in ["src", "tests", "benches", "examples"] {
+    for folder in ["src", "tests", "benches", "examples", "fuzz/src", "fuzz/fuzz_targets"] {
         let folder = root().join(folder);
         for file in if folder.is_dir() { sources(&folder) } else { Vec::new() } {
             assert!(read(&file).starts_with("//! "), "{} has no //! header", file.display());

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Runs everything that this project is tested by, part after part, from a fresh clone; stops at the first part that
 # fails. What the tests need and the machine lacks is installed, or named with the reason why its part is skipped.
-# FULL=1 adds the long runs: dependency policy, many property cases, campaigns of demos and deliveries, thirty tubes.
+# FULL=1 adds the long runs: dependency policy, many property cases, fuzzing (a minute each decoder; fuzz/run.sh alone
+# takes ten), campaigns of demos and deliveries, thirty tubes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -79,6 +80,7 @@ demo_campaign() {
 
 part tools tools
 part format cargo fmt --check
+part "format of the fuzz targets" cargo fmt --check --manifest-path fuzz/Cargo.toml
 part clippy cargo clippy --locked --all-targets
 part tests unit_tests
 part release cargo build --locked --release
@@ -90,6 +92,7 @@ part "can peers" bash tests/peers/can/run.sh target/release/benderd
 if [ "${FULL:-0}" = 1 ]; then
     part deny deny
     part "many property cases" env PROPTEST_CASES=2000 cargo test --locked
+    part fuzzing bash fuzz/run.sh 60
     part "demo campaign" demo_campaign
     part "ten thousand deliveries" cargo run --locked --release --example deliveries -- --count 10000
     part "deliveries over a pseudo terminal" cargo run --locked --release --example deliveries -- --real --count 200

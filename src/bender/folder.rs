@@ -130,9 +130,9 @@ impl Errand {
                 let image = status.and_then(|status| status.image(self.profile.table.program_bytes));
                 image.ok_or_else(|| "without a status".to_owned())
             }
-            Wants::Image(bytes) => image().map(|mut image| {
-                image.truncate(bytes);
-                image
+            Wants::Image(bytes) => image().and_then(|image| {
+                let asked = image.get(..bytes).map(<[u8]>::to_vec);
+                asked.ok_or_else(|| format!("with {} bytes instead of {bytes}", image.len()))
             }),
             Wants::Payload => image().map(|image| image[8..].to_vec()),
         };
@@ -157,6 +157,40 @@ impl Exchange for Errand {
                 Some(Ok(bytes)) => Action::Done(bytes),
                 Some(Err(failure)) => Action::Failed(failure),
             },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_table_shorter_than_what_was_staged_is_no_answer_to_reading_it_back() {
+        let profile = Profile::load("reference-folder").unwrap();
+        let staged = TableText {
+            version: 1,
+            revision: 8,
+            crc: 9,
+            program: "P".into(),
+            last_length: 7,
+            rows: vec![[1, 2, 3]],
+        };
+        let (table, crc) = written(&staged);
+        for (asked, whole) in [(48 + 12, true), (8, true), (48 + 24, false)] {
+            let mut protocol = SharedFolder::new(&profile, 1);
+            let mut exchange = protocol.begin(&Ask::ReadBack { bytes: asked });
+            exchange.on(Event::Begun, 0);
+            let mut answer = Answer::new(protocol.sequence, Said::Done);
+            answer.table_crc = Some(crc);
+            let letter = Letter { text: written(&answer).0, table: Some(table.clone()) };
+            match exchange.on(Event::Received(letter), 1) {
+                Action::Done(bytes) => assert_eq!((bytes.len(), whole), (asked, true)),
+                Action::Failed(Failure::Broken(why)) => {
+                    assert_eq!((why.as_str(), whole), ("the answer came with 60 bytes instead of 72", false));
+                }
+                other => panic!("{other:?}"),
+            }
         }
     }
 }

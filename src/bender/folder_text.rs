@@ -1,7 +1,8 @@
 //! The texts of the shared folder (protocols/shared-folder.md): commands, answers and tables, as TOML. Pure; both ends read and write
 //! them with it, so its tests hold against the contract's own examples.
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::profile::{Profile, WordOrder};
 use super::wire::{crc_of, text_of, u32_at};
@@ -30,6 +31,7 @@ pub enum Verb {
 #[serde(deny_unknown_fields)]
 pub struct Command {
     /// 1.
+    #[serde(deserialize_with = "version")]
     pub version: u32,
     /// The answer repeats it.
     pub sequence: u32,
@@ -72,6 +74,7 @@ pub enum Said {
 #[serde(deny_unknown_fields)]
 pub struct Answer {
     /// 1.
+    #[serde(deserialize_with = "version")]
     pub version: u32,
     /// The command's; 0 where that could not be read.
     pub sequence: u32,
@@ -153,6 +156,7 @@ impl StatusText {
 #[serde(deny_unknown_fields)]
 pub struct TableText {
     /// 1.
+    #[serde(deserialize_with = "version")]
     pub version: u32,
     /// 0: none.
     pub revision: u32,
@@ -224,6 +228,14 @@ pub fn table(crc: Option<u32>, bytes: Option<&[u8]>) -> Result<TableText, String
     read(bytes)
 }
 
+/// A text of another version may mean anything by its names.
+fn version<'a, D: Deserializer<'a>>(deserializer: D) -> Result<u32, D::Error> {
+    match u32::deserialize(deserializer)? {
+        VERSION => Ok(VERSION),
+        found => Err(D::Error::custom(format!("version {found}, known is {VERSION}"))),
+    }
+}
+
 fn padded(text: &str, bytes: usize) -> Option<Vec<u8>> {
     let mut out = text.as_bytes().to_vec();
     (out.len() <= bytes).then(|| {
@@ -264,6 +276,11 @@ mod tests {
         }
         assert!(read::<Command>(b"version = 1\nsequence = 1\ncommand = \"status\"\nmore = 1").is_err());
         assert!(read::<Command>(b"\xFF").is_err());
+        let why = read::<Command>(b"version = 2\nsequence = 1\ncommand = \"status\"").unwrap_err();
+        assert!(why.contains("version 2, known is 1"), "{why}");
+        let none = "version = 0\nrevision = 0\ncrc = 0\nprogram = \"\"\nlast_length = 0\nrows = []";
+        assert!(read::<TableText>(none.as_bytes()).is_err());
+        assert!(read::<TableText>(none.replacen('0', "1", 1).as_bytes()).is_ok());
     }
 
     proptest! {

@@ -86,6 +86,7 @@ pub use driver::{IntentLog, LogError, deliver};
 pub use exchange::{
     Action as ExchangeAction, Ask, Event as ExchangeEvent, Exchange, Failure, Port, Protocol,
 };
+pub use folder::SharedFolder;
 pub use folder_port::{FolderPort, Letter};
 pub use limits::{Reason, check_limits};
 pub use line::Wire;
@@ -98,6 +99,7 @@ pub use recording::Frames;
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
 pub use ring::{Content, Direction};
 pub use sdo::{Canopen, CanopenSettings, Object as SdoObject};
+pub use serial_table::SerialTable;
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{

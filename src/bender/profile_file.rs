@@ -141,6 +141,11 @@ impl Profile {
     pub fn parse(doc: &Document) -> Result<Profile, ConfigError> {
         let raw: RawProfile = doc.parse()?;
         integer(doc, &raw.version, "version", 1..=1)?;
+        if raw.registers.is_some() && raw.direct.is_some() {
+            let span = raw.transport.span();
+            let found = doc.text().get(span.clone()).unwrap_or("");
+            return Err(doc.value_error(span, "transport", found, "with one of [registers] and [direct]"));
+        }
         let sections = Sections {
             unit_id: raw.unit_id.as_ref(),
             modbus: raw.modbus.as_ref(),
@@ -193,7 +198,7 @@ impl Profile {
             layout,
             limits: parse_limits(doc, &raw.limits, &table)?,
             table,
-            state_bits: raw.state_bit.iter().map(|b| parse_state_bit(doc, b)).collect::<Result<_, _>>()?,
+            state_bits: parse_state_bits(doc, &raw.state_bit)?,
             deadlines,
         };
         if let (Some(map), Some(registers)) = (profile.transport.modbus(), &raw.registers) {
@@ -249,6 +254,17 @@ fn parse_table(
     })
 }
 
+fn parse_state_bits(doc: &Document, raw: &[RawStateBit]) -> Result<Vec<StateBit>, ConfigError> {
+    for (i, one) in raw.iter().enumerate() {
+        let bit = one.bit.get_ref();
+        if let Some(before) = raw[..i].iter().find(|before| before.bit.get_ref() == bit) {
+            let allowed = format!("each bit once: it is {:?} already", before.name.get_ref());
+            return Err(doc.value_error(one.bit.span(), "state_bit.bit", bit, allowed));
+        }
+    }
+    raw.iter().map(|one| parse_state_bit(doc, one)).collect()
+}
+
 fn program_bytes(doc: &Document, characters: &At<i64>) -> Result<usize, ConfigError> {
     let key = "table.program_characters";
     let found = integer(doc, characters, key, 4..=64)?;
@@ -277,14 +293,15 @@ fn parse_state_bit(doc: &Document, raw: &RawStateBit) -> Result<StateBit, Config
 }
 
 fn parse_limits(doc: &Document, raw: &RawLimits, table: &TableFormat) -> Result<MachineLimits, ConfigError> {
-    let mm = |value, key: &str| doc.in_range(value, &format!("limits.{key}"), 0.0..=100_000.0);
+    let mm = |value, key: &str, most| doc.in_range(value, &format!("limits.{key}"), 0.0..=most);
+    let max_length_mm = mm(&raw.max_length_mm, "max_length_mm", 100_000.0)?;
     let rad =
         |value, key: &str, max| Ok(doc.in_range(value, &format!("limits.{key}"), 0.0..=max)?.to_radians());
     Ok(MachineLimits {
         max_bends: integer(doc, &raw.max_bends, "limits.max_bends", 1..=1000)? as usize,
-        min_first_length_mm: mm(&raw.min_first_length_mm, "min_first_length_mm")?,
-        min_between_mm: mm(&raw.min_between_mm, "min_between_mm")?,
-        max_length_mm: mm(&raw.max_length_mm, "max_length_mm")?,
+        min_first_length_mm: mm(&raw.min_first_length_mm, "min_first_length_mm", max_length_mm)?,
+        min_between_mm: mm(&raw.min_between_mm, "min_between_mm", max_length_mm)?,
+        max_length_mm,
         max_angle_rad: rad(&raw.max_angle_deg, "max_angle_deg", 359.0)?,
         max_rotation_rad: rad(&raw.max_rotation_deg, "max_rotation_deg", 3600.0)?,
         length_resolution_mm: table.length_resolution_mm,
@@ -413,6 +430,19 @@ mod tests {
         assert!(complaint("127.0.0.1:5020", "127.0.0.1").contains("host:port"));
         assert!(complaint("settle_ms = 500", "settle_ms = 5000").contains("below confirm_ms (5000)"));
         assert!(complaint("characters = 32 ", "characters = 30 ").contains("multiple of 4"));
+        assert_eq!(
+            complaint("bit = 3", "bit = 1"),
+            format!(
+                "p.toml, line {}: state_bit.bit = 1, allowed is each bit once: it is \"between parts\" already",
+                line("bit = 3")
+            )
+        );
+        assert!(
+            complaint("first_length_mm = 10.0", "first_length_mm = 6000.1").contains("allowed is 0 to 6000")
+        );
+        assert!(complaint("min_between_mm = 0.0", "min_between_mm = 7e3").contains("allowed is 0 to 6000"));
+        let direct = "[direct]\nidentification = 1\nstate_coils = 2\nlength = 3\nrotation = 4\nangle = 5\n\n[constants]";
+        assert!(complaint("[constants]", direct).contains("with one of [registers] and [direct]"));
     }
 
     #[test]

@@ -153,10 +153,16 @@ impl Transfer {
             return None; // another machine's, or an older request's
         }
         match (answer.kind, asked.kind) {
-            (b'A', b'T') => Some(self.recalled(&answer.payload, now_ms)),
+            (b'A', b'T') => {
+                let most = usize::from(asked.payload[3]);
+                Some(self.recalled(&answer.payload, most, now_ms))
+            }
             (b'A', kind) => {
-                let asked_bytes =
-                    if kind == b'R' { usize::from(asked.payload[3]) } else { answer.payload.len() };
+                let asked_bytes = match kind {
+                    b'R' => usize::from(asked.payload[3]),
+                    b'S' => answer.payload.len(), // who reads it knows how long it is
+                    _ => 0,
+                };
                 if answer.payload.len() != asked_bytes {
                     let found = answer.payload.len();
                     return Some(Action::Failed(Failure::Broken(format!(
@@ -174,21 +180,23 @@ impl Transfer {
         }
     }
 
-    /// A piece of the active table, which says how long that is.
-    fn recalled(&mut self, payload: &[u8], now_ms: u64) -> Action<Vec<u8>> {
+    /// A piece of the active table, which says how long that is; `asked` bytes of it were asked for.
+    fn recalled(&mut self, payload: &[u8], asked: usize, now_ms: u64) -> Action<Vec<u8>> {
         let Some((length, bytes)) = payload.split_at_checked(2) else {
             return Action::Failed(Failure::Broken("a recalled piece without the table's length".into()));
         };
         let length = usize::from(u16::from_be_bytes([length[0], length[1]]));
+        let left = length.saturating_sub(self.answer.len());
         self.answer.extend(bytes);
-        if self.answer.len() > length || (bytes.is_empty() && self.answer.len() < length) {
-            let found = self.answer.len();
+        self.requests.pop_front();
+        let found = self.answer.len();
+        // Fewer than asked at the end only: behind a gap the next piece would be taken for what is missing.
+        if found > length || bytes.len() != left.min(asked) || (found < length && self.requests.is_empty()) {
             return Action::Failed(Failure::Broken(format!(
                 "{found} bytes of a table of {length} were recalled"
             )));
         }
-        self.requests.pop_front();
-        if self.answer.len() == length {
+        if found == length {
             self.requests.clear();
         }
         self.begin(now_ms)
@@ -300,5 +308,31 @@ mod tests {
         let piece = |bytes: usize| [vec![0, 130], vec![5; bytes]].concat();
         assert_eq!(sent(exchange.on(answer(1, b'A', &piece(124)), 1)).payload, [0, 124, 0, 124]);
         assert_eq!(exchange.on(answer(2, b'A', &piece(6)), 2), Action::Done(vec![5; 130]));
+    }
+
+    #[test]
+    fn a_recalled_table_with_a_gap_or_longer_than_any_is_none() {
+        let piece = |length: u16, bytes: usize| [&length.to_be_bytes()[..], &vec![5; bytes]].concat();
+        let broken = |action| matches!(action, Action::Failed(Failure::Broken(_)));
+        let mut gap = exchange(&Ask::Recall);
+        sent(gap.on(Event::Begun, 0));
+        assert!(broken(gap.on(answer(1, b'A', &piece(130, 100)), 1)));
+
+        let mut long = exchange(&Ask::Recall);
+        sent(long.on(Event::Begun, 0));
+        for sequence in 1..5 {
+            sent(long.on(answer(sequence, b'A', &piece(700, 124)), 1));
+        }
+        assert!(broken(long.on(answer(5, b'A', &piece(700, 24)), 1)), "the longest has 520 bytes");
+    }
+
+    #[test]
+    fn the_answer_to_a_write_carries_nothing() {
+        for ask in [Ask::Stage(vec![1, 2]), Ask::Commit(TableId { revision: 8, crc: 9 })] {
+            let mut exchange = exchange(&ask);
+            sent(exchange.on(Event::Begun, 0));
+            let failed = exchange.on(answer(1, b'A', &[0]), 1);
+            assert!(matches!(failed, Action::Failed(Failure::Broken(_))), "{failed:?}");
+        }
     }
 }

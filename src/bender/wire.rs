@@ -132,7 +132,7 @@ pub fn encode_payload(
     out.extend(count.to_be_bytes());
     out.extend([0, 0]);
     let mut put = |bend: Option<usize>, column: &str, number: f64| {
-        if number.abs() <= most {
+        if (-most - 1.0..=most).contains(&number) {
             out.extend(profile.table.word_order.arrange((number as i32).to_be_bytes()));
         } else {
             let text = format!("{column}: {number} steps do not fit the machine's numbers");
@@ -309,6 +309,19 @@ mod tests {
         assert_eq!(payload[at..at + 4], 60_000_i32.to_be_bytes());
         let (_, back) = decode_payload(&p, &payload).unwrap();
         assert!((back.bends[1].rotation_rad.to_degrees() + 60.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_least_number_is_one_too() {
+        for reversed in [false, true] {
+            let mut p = profile();
+            p.table.rotation_reversed = reversed;
+            let mut payload = encode_payload(&p, "AB-1", &table()).unwrap();
+            let at = p.payload_header_bytes() + 4;
+            payload[at..at + 4].copy_from_slice(&i32::MIN.to_be_bytes());
+            let (program, least) = decode_payload(&p, &payload).unwrap();
+            assert_eq!(encode_payload(&p, &program, &least).unwrap(), payload);
+        }
     }
 
     #[test]

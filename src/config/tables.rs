@@ -119,7 +119,8 @@ impl<'a> Row<'a> {
 
     fn number(&self, doc: &Document, column: usize, allowed: &Allowed) -> Result<f64, ConfigError> {
         let cell = self.cells[column];
-        match cell.parse::<f64>() {
+        // Rounded before it is judged: a table that was read can be written and read again.
+        match cell.parse::<f64>().map(rounded) {
             Ok(value) if (allowed.ok)(value) => Ok(value),
             _ => Err(value_error(doc, self.line, self.columns[column], format!("{cell:?}"), allowed.text)),
         }
@@ -220,9 +221,14 @@ fn value_error(
     }
 }
 
-/// Millimetres rounded to 1e-9: 99.99999999999999 stays 100 in a file; and never "-0".
+/// To 1e-9, as values are written: 99.99999999999999 stays 100 in a file.
+fn rounded(value: f64) -> f64 {
+    (value * 1e9).round() / 1e9
+}
+
+/// Never "-0".
 fn mm(value: f64) -> String {
-    ((value * 1e9).round() / 1e9 + 0.0).to_string()
+    (rounded(value) + 0.0).to_string()
 }
 
 fn degrees(rad: f64) -> String {
@@ -281,6 +287,15 @@ mod tests {
         assert!(parse("length_mm,rotation_deg,angle_deg,radius_mm\n").unwrap_err().contains("rows = none"));
         assert!(parse("x_mm,y_mm,z_mm,radius_mm\n1,2,3,\n").unwrap_err().contains("at least 2 points"));
         assert!(parse("x_mm,y_mm,z_mm,radius_mm\n0,0,0,\n1,0,0,\n1,1,0,\n").unwrap_err().contains("line 3"));
+    }
+
+    #[test]
+    fn what_rounds_to_a_forbidden_value_is_refused_at_once() {
+        let case = |from: &str, to: &str| parse(&LRA_TEXT.replacen(from, to, 1));
+        assert!(case("92.1,", "359.9999999999,").unwrap_err().contains("angle_deg = \"359.9999999999\""));
+        assert!(case("92.1,50.8", "92.1,1e-10").unwrap_err().contains("radius_mm = \"1e-10\""));
+        let table = case("92.1,", "359.999999999,").unwrap();
+        assert_eq!(parse(&format_table(&table)).unwrap(), table);
     }
 
     #[test]

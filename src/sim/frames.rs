@@ -96,21 +96,32 @@ impl Listener {
         Listener { framing, buffer: Vec::new() }
     }
 
-    /// Takes what arrived; a request when it is complete. What is no frame waits for [`Listener::silence`].
-    pub fn take(&mut self, bytes: &[u8]) -> Option<Heard> {
+    /// Takes what arrived; the requests that it completes. What is no frame waits for [`Listener::silence`].
+    pub fn take(&mut self, bytes: &[u8]) -> Vec<Heard> {
         self.buffer.extend(bytes);
+        let mut heard = Vec::new();
+        while let Some(frame) = self.frame() {
+            heard.extend(self.parse(&frame));
+        }
+        heard
+    }
+
+    /// The next frame, when it is complete.
+    fn frame(&mut self) -> Option<Vec<u8>> {
         let length = match self.framing {
             Framing::Rtu => self.rtu_length()?,
             Framing::Tcp => self.tcp_length()?,
         };
-        if self.buffer.len() < length {
-            return None;
-        }
-        let frame: Vec<u8> = self.buffer.drain(..length).collect();
+        (self.buffer.len() >= length).then(|| self.buffer.drain(..length).collect())
+    }
+
+    fn parse(&mut self, frame: &[u8]) -> Option<Heard> {
         match self.framing {
+            // Another protocol's number is no Modbus.
+            Framing::Tcp if frame[2..4] != [0, 0] => None,
             Framing::Tcp => parse(u16::from_be_bytes([frame[0], frame[1]]), &frame[HEADER - 1..]),
             Framing::Rtu => {
-                let (body, crc) = frame.split_at(length - 2);
+                let (body, crc) = frame.split_at(frame.len() - 2);
                 if crc16(body).to_le_bytes() == crc {
                     return parse(0, body);
                 }
@@ -157,13 +168,16 @@ impl Listener {
 fn parse(transaction: u16, body: &[u8]) -> Option<Heard> {
     let word = |at: usize| Some(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
     let request = match *body.get(1)? {
+        // What has another length than its function or its counts say is not the request that it seems to be.
+        1 | 3 if body.len() != 6 => return None,
         1 => Request::ReadCoils { address: word(2)?, count: word(4)? },
         3 => Request::Read { address: word(2)?, count: word(4)? },
         16 => {
+            let bytes = body.get(7..)?;
             let words: Vec<u16> =
-                body.get(7..)?.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
-            // A count that disagrees with the bytes is not the request that it seems to be.
-            (words.len() == usize::from(word(4)?)).then_some(Request::Write { address: word(2)?, words })?
+                bytes.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
+            let fits = bytes.len() == usize::from(body[6]) && bytes.len() == 2 * usize::from(word(4)?);
+            fits.then_some(Request::Write { address: word(2)?, words })?
         }
         function => Request::Other { function },
     };
@@ -226,7 +240,7 @@ mod tests {
     #[test]
     fn frames_written_out_by_hand() {
         assert_eq!(crc16(b"123456789"), 0x4B37, "the check value of CRC-16/MODBUS");
-        let heard = Listener::new(Framing::Rtu).take(&READ).unwrap();
+        let heard = Listener::new(Framing::Rtu).take(&READ).remove(0);
         assert_eq!(
             heard,
             Heard { unit: 17, transaction: 0, request: Request::Read { address: 107, count: 3 } }
@@ -240,9 +254,9 @@ mod tests {
     fn the_same_over_tcp() {
         let request = [0x12, 0x34, 0, 0, 0, 6, 0x11, 0x03, 0x00, 0x6B, 0x00, 0x03];
         let mut listener = Listener::new(Framing::Tcp);
-        assert_eq!(listener.take(&request[..9]), None);
+        assert_eq!(listener.take(&request[..9]), []);
         listener.silence();
-        let heard = listener.take(&request[9..]).unwrap();
+        let heard = listener.take(&request[9..]).remove(0);
         assert_eq!(
             heard,
             Heard { unit: 17, transaction: 0x1234, request: Request::Read { address: 107, count: 3 } }
@@ -256,11 +270,34 @@ mod tests {
         let mut listener = Listener::new(Framing::Rtu);
         let mut broken = READ;
         broken[3] ^= 1;
-        assert_eq!(listener.take(&broken), None);
-        assert!(listener.take(&READ).is_some());
-        assert_eq!(listener.take(&READ[..5]), None);
+        assert_eq!(listener.take(&broken), []);
+        assert_eq!(listener.take(&READ).len(), 1);
+        assert_eq!(listener.take(&READ[..5]), []);
         listener.silence();
-        assert!(listener.take(&READ).is_some());
+        assert_eq!(listener.take(&READ).len(), 1);
+    }
+
+    #[test]
+    fn two_requests_in_one_piece_are_both_heard() {
+        let one = |transaction| [0, transaction, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1];
+        let heard = Listener::new(Framing::Tcp).take(&[one(1), one(2)].concat());
+        assert_eq!(heard.iter().map(|heard| heard.transaction).collect::<Vec<_>>(), [1, 2]);
+    }
+
+    #[test]
+    fn counts_and_lengths_that_disagree_are_no_request() {
+        let tcp = |protocol: u8, body: &[u8]| {
+            let frame = [&[0, 7, 0, protocol, 0, body.len() as u8], body].concat();
+            Listener::new(Framing::Tcp).take(&frame).len()
+        };
+        let write = [1, 16, 0, 0, 0, 1, 2, 0xAB, 0xCD];
+        assert_eq!((tcp(0, &write), tcp(1, &write)), (1, 0), "another protocol");
+        assert_eq!(tcp(0, &[1, 16, 0, 0, 0, 1, 4, 0xAB, 0xCD]), 0, "more bytes announced");
+        assert_eq!(tcp(0, &[1, 16, 0, 0, 0, 1, 3, 0xAB, 0xCD, 0xEF]), 0, "half a register");
+        assert_eq!(tcp(0, &[1, 3, 0, 0, 0, 1, 0]), 0, "a read with more behind it");
+        let mut odd = vec![1, 16, 0, 0, 0, 1, 3, 0xAB, 0xCD, 0xEF];
+        odd.extend(crc16(&odd).to_le_bytes());
+        assert_eq!(Listener::new(Framing::Rtu).take(&odd), []);
     }
 
     proptest! {
@@ -274,7 +311,7 @@ mod tests {
             let crc = crc16(&frame);
             frame.extend(crc.to_le_bytes());
             let mut listener = Listener::new(Framing::Rtu);
-            let heard: Vec<Heard> = frame.chunks(cut).filter_map(|piece| listener.take(piece)).collect();
+            let heard: Vec<Heard> = frame.chunks(cut).flat_map(|piece| listener.take(piece)).collect();
             prop_assert_eq!(&heard, &[Heard { unit: 1, transaction: 0, request: Request::Write { address, words } }]);
         }
 

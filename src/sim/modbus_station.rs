@@ -59,12 +59,15 @@ impl Station for ModbusStation {
     type Piece = Vec<u8>;
 
     fn hear(&mut self, piece: Vec<u8>, controller: &mut Controller<'_>) -> Vec<Vec<u8>> {
-        let Some(heard) = self.listener.take(&piece) else { return Vec::new() };
-        if controller.is_deaf() {
-            return Vec::new();
+        let mut answers = Vec::new();
+        for heard in self.listener.take(&piece) {
+            if controller.is_deaf() {
+                continue;
+            }
+            let answer = self.answer(&heard, controller);
+            answers.extend(answer.map(|answer| encode(self.framing, &heard, &answer)));
         }
-        let answer = self.answer(&heard, controller);
-        answer.iter().map(|answer| encode(self.framing, &heard, answer)).collect()
+        answers
     }
 
     fn silence(&mut self) {

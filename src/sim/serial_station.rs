@@ -15,6 +15,15 @@ const NO_NUMBER: u8 = 0xFF;
 /// Longest frame in characters, without the colon.
 const LONGEST: usize = 9 + 2 * 128 + 8;
 
+/// Bytes of an area in one request or answer.
+const PIECE: usize = 124;
+
+/// Capital hexadecimal digits, nothing else.
+fn hex(digits: &str) -> Option<u8> {
+    let capital = digits.bytes().all(|digit| matches!(digit, b'0'..=b'9' | b'A'..=b'F'));
+    capital.then(|| u8::from_str_radix(digits, 16).ok()).flatten()
+}
+
 /// One machine on one line.
 #[derive(Debug)]
 pub struct SerialStation {
@@ -36,16 +45,16 @@ impl SerialStation {
         if body.len() < 9 || format!("{:08X}", crc_of(body.as_bytes())) != crc {
             return garbled();
         }
-        let hex = |digits: &str| u8::from_str_radix(digits, 16).ok();
-        let unit = hex(body.get(0..2)?)?;
-        if unit != self.unit {
+        if hex(body.get(0..2)?)? != self.unit {
             return None;
         }
-        let (sequence, kind) = (hex(body.get(2..4)?)?, body.get(4..5)?);
-        let digits = body.get(9..)?;
+        let (sequence, kind, digits) = (hex(body.get(2..4)?), body.get(4..5)?, body.get(9..)?);
         let payload: Option<Vec<u8>> =
-            (0..digits.len() / 2).map(|at| hex(digits.get(2 * at..2 * at + 2)?)).collect();
-        let payload = payload?;
+            (0..digits.len()).step_by(2).map(|at| hex(digits.get(at..at + 2)?)).collect();
+        let (Some(sequence), Some(payload)) = (sequence, payload) else { return garbled() };
+        if body.get(5..9)? != format!("{:04X}", payload.len()) {
+            return garbled();
+        }
         let reply = self.reply(kind, &payload, controller)?;
         Some(match reply {
             Ok(bytes) => self.answer(sequence, 'A', &bytes),
@@ -67,10 +76,11 @@ impl SerialStation {
         let long = |at: usize| payload.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
         Some(match (kind, payload.len()) {
             ("S", 0) => Ok(controller.model.status_image()),
-            ("W", 2..) => {
+            ("W", 2..=126) => {
                 let written = controller.model.write_staging(word(0)?, &payload[2..]);
                 if written { Ok(Vec::new()) } else { Err(OUTSIDE) }
             }
+            ("R" | "T", 4) if word(2)? > PIECE => Err(OUTSIDE),
             ("R", 4) => {
                 let (offset, count) = (word(0)?, word(2)?);
                 controller.model.staging().get(offset..offset + count).map(<[u8]>::to_vec).ok_or(OUTSIDE)
@@ -120,5 +130,46 @@ impl Station for SerialStation {
             }
         }
         answers
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bender::Profile;
+    use crate::sim::bender::MachineModel;
+
+    /// Kind, length and payload of the answer to a frame of these characters.
+    fn answer(body: &str) -> Option<String> {
+        let mut model = MachineModel::new(Profile::load("reference-serial").unwrap(), "P", 1);
+        let mut mute = false;
+        let mut controller = Controller::new(&mut model, None, &mut mute);
+        let frame = format!(":{body}{:08X}\r\n", crc_of(body.as_bytes())).into_bytes();
+        let answers = SerialStation::new(1).hear(frame, &mut controller);
+        answers.first().map(|text| String::from_utf8_lossy(&text[5..text.len() - 10]).into_owned())
+    }
+
+    #[test]
+    fn what_is_no_frame_of_the_contract_is_garbled_in_spite_of_its_crc() {
+        assert_eq!(answer("0107R000400000002").as_deref(), Some("A00020000"));
+        for (body, why) in [
+            ("0107R000300000002", "another length than its payload has"),
+            ("0107R00040000000", "half a byte"),
+            ("0107R0004000000+2", "a sign is no digit"),
+            ("01+7R000400000002", "nor in the number"),
+            ("0107R00040000000a", "a small letter"),
+        ] {
+            assert_eq!(answer(body).as_deref(), Some("N000101"), "{why}");
+        }
+        assert_eq!(answer("0207R000400000002"), None, "another machine's");
+    }
+
+    #[test]
+    fn no_answer_is_longer_than_a_frame() {
+        assert!(answer("0107R00040000007C").unwrap().starts_with("A007C"));
+        for kind in ["R", "T"] {
+            assert_eq!(answer(&format!("0107{kind}00040000007D")).as_deref(), Some("N000102"));
+        }
+        assert_eq!(answer(&format!("0107W007F0000{}", "00".repeat(125))).as_deref(), Some("N000104"));
     }
 }
