@@ -27,6 +27,9 @@ struct Args {
     /// Over the transport's own pseudo terminal, socket or folder, with short deadlines.
     #[arg(long)]
     real: bool,
+    /// The CAN interface [default: the profile's].
+    #[arg(long)]
+    on: Option<String>,
     /// Of a thousand answers so many are damaged.
     #[arg(long, default_value_t = 100)]
     per_mille: u32,
@@ -35,6 +38,9 @@ struct Args {
 fn main() -> anyhow::Result<ExitCode> {
     let args = Args::parse();
     let mut profile = Profile::load(&args.profile)?;
+    if let Some(on) = &args.on {
+        profile.endpoint.clone_from(on);
+    }
     if args.real {
         hurry(&mut profile);
     }
@@ -76,10 +82,16 @@ fn main() -> anyhow::Result<ExitCode> {
 
 /// Deadlines of a machine that answers at once, or hundreds of lost answers would take an hour.
 fn hurry(profile: &mut Profile) {
-    profile.deadlines.request = Duration::from_millis(60);
-    profile.deadlines.settle_ms = 60;
+    let on_bus = matches!(profile.transport, Transport::Can(_) | Transport::Canopen(_));
+    // A status comes by itself ten times a second there.
+    profile.deadlines.request = Duration::from_millis(if on_bus { 300 } else { 60 });
+    profile.deadlines.poll_ms = 5;
+    profile.deadlines.settle_ms = 70;
     profile.deadlines.confirm_ms = 1500;
-    if let Transport::ModbusRtu(_, line, _) | Transport::ModbusRtuOverTcp(_, line) = &mut profile.transport {
-        line.quiet = Duration::from_millis(60);
+    match &mut profile.transport {
+        Transport::ModbusRtu(_, line, _)
+        | Transport::ModbusRtuOverTcp(_, line)
+        | Transport::SerialTable(_, line, _) => line.quiet = Duration::from_millis(60),
+        _ => {}
     }
 }

@@ -6,13 +6,11 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Duration;
 
-use schemars::JsonSchema;
-use serde::Deserialize;
-
-use super::profile::{Deadlines, Profile, Sequence, StateBit, TableFormat, WordOrder};
-use super::profile_can::{RawCan, RawCanopen, check_can};
-use super::profile_modbus::{RawDirect, RawModbus, RawRegisters, check_areas};
-use super::profile_transport::{RawLine, RawMap, RawSerial, RawTransport, Sections, parse_transport};
+use super::profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
+use super::profile_can::check_can;
+use super::profile_modbus::check_areas;
+use super::profile_raw::{RawDeadlines, RawLimits, RawProfile, RawStateBit, RawTable};
+use super::profile_transport::{RawMap, Sections, parse_transport};
 use super::transport::Transport;
 use crate::config::{At, ConfigError, Document};
 use crate::tube::MachineLimits;
@@ -34,90 +32,6 @@ const UNKEPT_PROGRAM: usize = 32;
 /// Names of the profiles that come with the program.
 pub fn shipped_profiles() -> impl Iterator<Item = &'static str> {
     SHIPPED.iter().map(|(name, _)| *name)
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawProfile {
-    version: At<i64>,
-    name: At<String>,
-    description: At<String>,
-    transport: At<RawTransport>,
-    endpoint: At<String>,
-    unit_id: Option<At<i64>>,
-    modbus: Option<RawModbus>,
-    registers: Option<RawRegisters>,
-    direct: Option<RawDirect>,
-    line: Option<RawLine>,
-    serial: Option<RawSerial>,
-    can: Option<RawCan>,
-    canopen: Option<RawCanopen>,
-    constants: RawConstants,
-    table: RawTable,
-    state_bit: Vec<RawStateBit>,
-    limits: RawLimits,
-    deadlines: RawDeadlines,
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawConstants {
-    identification: At<i64>,
-    layout: Option<At<i64>>,
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawTable {
-    program_characters: Option<At<i64>>,
-    length_resolution_mm: At<f64>,
-    angle_resolution_deg: At<f64>,
-    rotation_sign: At<i64>,
-    #[serde(default)]
-    feed: Sequence,
-    #[serde(default)]
-    rotation: Sequence,
-    columns: Option<RawColumns>,
-}
-
-/// What the machine's screen calls them.
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawColumns {
-    length: At<String>,
-    rotation: At<String>,
-    angle: At<String>,
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawStateBit {
-    bit: At<i64>,
-    name: At<String>,
-    must_be: bool,
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawLimits {
-    max_bends: At<i64>,
-    min_first_length_mm: At<f64>,
-    min_between_mm: At<f64>,
-    max_length_mm: At<f64>,
-    max_angle_deg: At<f64>,
-    max_rotation_deg: At<f64>,
-}
-
-#[derive(Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-struct RawDeadlines {
-    connect_ms: At<i64>,
-    request_ms: At<i64>,
-    transfer_ms: Option<At<i64>>,
-    heartbeat_ms: At<i64>,
-    confirm_ms: At<i64>,
-    settle_ms: At<i64>,
-    poll_ms: At<i64>,
 }
 
 impl Profile {

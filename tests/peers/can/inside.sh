@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # What run.sh runs inside user-mode Linux: brings up vcan0 and puts independent peers on it, candump and cantools that
-# read along, canopen as the bender. /run is the only place that can be written. Usage: inside.sh BINARY PYTHON
+# read along, canopen as the bender. /run is the only place that can be written. Usage: inside.sh BINARY PYTHON COUNT
 set -euo pipefail
-binary=$1 python=$2
+binary=$1 python=$2 count=$3
 here=$(cd "$(dirname "$0")" && pwd)
 dbc=$here/../../../protocols/bender.dbc
 mkdir /run/peers
@@ -58,3 +58,14 @@ delivered reference-canopen vcan0
 stop
 sed 1d bender.log
 "$python" "$here/canopen_peer.py" compare bender.log second.csv bracket 2
+
+# Deliveries over the socket, with damaged answers and trouble at the machine.
+deliveries=$(dirname "$binary")/examples/deliveries
+if [ -x "$deliveries" ] && [ "$count" -gt 0 ]; then
+    for profile in reference-can reference-canopen; do
+        TMPDIR=/run "$deliveries" --profile "$profile" --real --on vcan0 --count "$count" --per-mille 4
+        echo "ok  $count deliveries over $profile on vcan0"
+    done
+else
+    echo "skipped: deliveries over vcan0: cargo build --release --examples"
+fi

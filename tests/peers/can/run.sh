@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # Runs inside.sh in user-mode Linux, a kernel with CAN as an ordinary process: this machine's own kernel needs none. The
-# guest sees this machine's files, read only; it is killed when it is done, or after two minutes. Where it does not come
-# up, the reason is printed and nothing is tested. Usage: run.sh BINARY (after install.sh)
+# guest sees this machine's files, read only; it is killed when it is done, or after two minutes and four seconds for each
+# delivery. Where it does not come up, the reason is printed and nothing is tested.
+# Usage: run.sh BINARY [COUNT] (after install.sh); so many deliveries go over vcan0 for each of its protocols, 5 unless said.
 set -euo pipefail
 binary=$(realpath "${1:?usage: run.sh BINARY}")
+count=${2:-5}
 here=$(cd "$(dirname "$0")" && pwd)
 python=${XDG_CACHE_HOME:-$HOME/.cache}/benderd-tests/can-$(cksum <"$here/requirements.txt" | cut -d ' ' -f 1)/bin/python
 began="CAN peers begin" ended="CAN peers end with status"
@@ -41,17 +43,17 @@ mount -t proc proc /proc
 mount -t sysfs sysfs /sys
 mount -t tmpfs tmpfs /run
 echo "$began on kernel \$(uname -r)"
-bash $(printf '%q ' "$here/inside.sh" "$binary" "$python")
+bash $(printf '%q ' "$here/inside.sh" "$binary" "$python" "$count")
 echo "$ended \$?"
 exec sleep 1000
 INIT
 chmod +x "$work/init"
 
-begin=$SECONDS
+begin=$SECONDS limit=$((120 + 4 * count))
 setsid linux.uml mem=512M quiet uml_dir="$work/uml" rootfstype=hostfs rootflags=/ ro init="$work/init" \
     con=null con0=fd:0,fd:1 >"$work/console" 2>&1 </dev/null &
 guest=$!
-until grep -q "^$ended [0-9]" "$work/console" || ! kill -0 "$guest" 2>/dev/null || [ $((SECONDS - begin)) -ge 120 ]; do
+until grep -q "^$ended [0-9]" "$work/console" || ! kill -0 "$guest" 2>/dev/null || [ $((SECONDS - begin)) -ge "$limit" ]; do
     sleep 0.1
 done
 kill -9 -- "-$guest" 2>/dev/null || true
