@@ -139,3 +139,22 @@ fn a_profiles_requests_are_printed() {
     let (code, err) = benderd(dir.path(), &["check"]);
     assert!(code == 2 && err.contains("--plan"), "{err}");
 }
+
+#[test]
+fn every_shipped_profile_has_a_plan_that_says_how_a_table_gets_there() {
+    for profile in benderd::bender::shipped_profiles() {
+        let output =
+            Command::cargo_bin("benderd").unwrap().args(["check", "--plan", profile]).output().unwrap();
+        assert_eq!(output.status.code(), Some(0));
+        let text = String::from_utf8(output.stdout).unwrap();
+        let says = match profile {
+            "ten-row" => "every write needs the operator's approval",
+            "reference-can" => "132 times 320 TABLE_ITEM",
+            "reference-canopen" => "download of 528 bytes to object 2001:00, in blocks",
+            "reference-serial" => "5 frames W",
+            "reference-folder" => "bender1.tab, bender1.cmd (stage), bender1.ans",
+            _ => "commit, once",
+        };
+        assert!(text.contains(says), "{profile}: {text}");
+    }
+}

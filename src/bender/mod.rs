@@ -101,7 +101,7 @@ pub use recording::Frames;
 pub use registers::{Field, ModbusMap, Registers, decode_status, fields, status_span};
 pub use ring::{Content, Direction};
 pub use sdo::{Canopen, CanopenSettings, Object as SdoObject};
-pub use serial_table::SerialTable;
+pub use serial_table::{PIECE as SERIAL_PIECE, SerialTable};
 pub use status_image::{decode_status_image, status_bytes};
 pub use transport::{Device, LineSettings, Parity, SerialSettings, Transport};
 pub use wire::{

@@ -17,7 +17,7 @@ use super::serial_frame::{Decoder, Frame, MOST_PAYLOAD};
 const REPEATS: u32 = 2;
 
 /// Bytes of an area in one frame: an offset and a length take four.
-const PIECE: usize = MOST_PAYLOAD - 4;
+pub const PIECE: usize = MOST_PAYLOAD - 4;
 
 /// Codes of a refusal.
 const GARBLED: u8 = 1;

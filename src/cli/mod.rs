@@ -9,6 +9,7 @@ mod correct;
 mod demo;
 mod export;
 mod inspect;
+mod plan_objects;
 mod plan_text;
 mod progress;
 mod push;

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use super::plan_objects;
 use crate::bender::plan::{self, Request};
 use crate::bender::{
     Device, DirectMap, ModbusMap, Parity, Profile, Sequence, SerialSettings, Transport, WordOrder, fields,
@@ -49,7 +50,7 @@ fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
     match profile.transport.device() {
         Some(Device::Staged(map)) => write_requests(out, profile, map),
         Some(Device::Direct(map)) => write_columns(out, profile, map),
-        None => Ok(()),
+        None => plan_objects::write(out, profile),
     }
 }
 
