@@ -214,3 +214,15 @@ async fn what_cannot_be_used_is_status_2() {
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("allowed is host:port"));
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_machine_without_a_staging_area_is_only_read() {
+    let profile = Profile::load("ten-row").unwrap();
+    let (door, _) = Door::open(&profile, "127.0.0.1:0").await.unwrap();
+    let bender = SimulatedBender::start(door, MachineModel::new(profile, "", 0), None, |_| ()).unwrap();
+    let text = said(&selftest("ten-row", bender.address(), &["--write-staging"]).await, 0);
+    assert!(step(&text, "heartbeat").starts_with("skipped"), "{text}");
+    assert!(step(&text, "write staging").contains("what is written is in force"), "{text}");
+    assert!(step(&text, "active table").contains("its rows are all 0"), "{text}");
+    assert!(bender.with(|m| m.active_payload()).is_empty(), "nothing was written");
+}

@@ -254,6 +254,11 @@ fn parse_deadlines(
         settle_ms: ms(&raw.settle_ms, "settle_ms", 600_000)?,
         poll_ms: ms(&raw.poll_ms, "poll_ms", 10_000)?,
     };
+    if matches!(transport, Transport::Folder(_)) && deadlines.settle_ms <= request {
+        let allowed = format!("above request_ms ({request}): a command file may be carried out that late");
+        let span = raw.settle_ms.span();
+        return Err(doc.value_error(span, "deadlines.settle_ms", deadlines.settle_ms, allowed));
+    }
     if deadlines.settle_ms >= deadlines.confirm_ms {
         let allowed = format!("below confirm_ms ({})", deadlines.confirm_ms);
         let span = raw.settle_ms.span();
@@ -357,6 +362,18 @@ mod tests {
         assert!(complaint("min_between_mm = 0.0", "min_between_mm = 7e3").contains("allowed is 0 to 6000"));
         let direct = "[direct]\nidentification = 1\nstate_coils = 2\nlength = 3\nrotation = 4\nangle = 5\n\n[constants]";
         assert!(complaint("[constants]", direct).contains("with one of [registers] and [direct]"));
+    }
+
+    #[test]
+    fn a_folder_is_given_the_time_in_which_a_command_may_still_be_carried_out() {
+        let text = include_str!("../../protocols/reference-folder.toml");
+        let with = |ms: &str| parse(&text.replacen("settle_ms = 2500", ms, 1));
+        assert!(
+            with("settle_ms = 2000")
+                .unwrap_err()
+                .contains("settle_ms = 2000, allowed is above request_ms (2000)")
+        );
+        assert!(with("settle_ms = 2001").is_ok());
     }
 
     #[test]
