@@ -135,3 +135,16 @@ async fn a_frozen_controller_beats_no_more() {
     bench.told().await;
     assert_eq!(bench.status().await.heartbeat, before);
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_machine_that_leaves_the_bus_is_heard_again() {
+    for profile in ["reference-can", "reference-canopen"] {
+        let mut bench = bench(profile, &[(When::Answer(2), Trouble::BusOff)]);
+        assert_eq!(bench.status().await.program, "P1", "{profile}");
+        assert_eq!(bench.status().await.program, "P1", "{profile}");
+        assert_eq!(bench.told().await, ["answer 2: bus-off"], "{profile}");
+    }
+    // What is on no bus does not notice.
+    let mut bench = bench("reference-rtu", &[(When::Answer(1), Trouble::BusOff)]);
+    assert_eq!(bench.link.read_status().await.unwrap().program, "P1");
+}

@@ -96,7 +96,6 @@ fn trouble(doc: &Document, event: &At<RawEvent>) -> Result<Trouble, ConfigError>
         Err(doc.value_error(event.span(), "event", found, allowed))
     };
     Ok(match (what, late_ms, after_bytes) {
-        (RawWhat::BusOff, ..) => return wrong("no bus-off: it is reserved for machines on a CAN bus"),
         (RawWhat::Late, Some(ms), None) => Trouble::Reply(ReplyFault::Late { ms: *ms }),
         (RawWhat::Cut, None, Some(bytes)) => Trouble::Cut { bytes: *bytes },
         (RawWhat::EmergencyStop, None, Some(bytes)) => Trouble::EmergencyStop { bytes: *bytes },
@@ -112,6 +111,7 @@ fn trouble(doc: &Document, event: &At<RawEvent>) -> Result<Trouble, ConfigError>
         (RawWhat::Garbage, None, None) => Trouble::Reply(ReplyFault::Garbage),
         (RawWhat::Busy, None, None) => Trouble::Busy,
         (RawWhat::HalfClose, None, None) => Trouble::HalfClose,
+        (RawWhat::BusOff, None, None) => Trouble::BusOff,
         (RawWhat::Reboot, None, None) => Trouble::Reboot,
         (RawWhat::Edit, None, None) => Trouble::Edit,
         (RawWhat::OtherProgram, None, None) => Trouble::OtherProgram,
@@ -137,7 +137,7 @@ mod tests {
         let mut kinds: Vec<String> = events.iter().map(|(_, trouble)| trouble.to_string()).collect();
         kinds.sort();
         kinds.dedup();
-        assert_eq!(kinds.len(), 16, "{kinds:?}");
+        assert_eq!(kinds.len(), 17, "{kinds:?}");
         assert_eq!(events[0], (When::Answer(2), Trouble::Reply(ReplyFault::Lost)));
         for when in [When::Ms(60_000), When::Commit, When::TakenOver] {
             assert!(events.iter().any(|(at, _)| *at == when), "{when}");
@@ -155,7 +155,6 @@ mod tests {
         assert!(complaint(&event("at_ms = 1\nwhat = \"late\"")).contains("late with late_ms"));
         assert!(complaint(&event("at_ms = 1\nwhat = \"emergency-stop\"")).contains("after_bytes"));
         assert!(complaint(&event("at_ms = 1\nlate_ms = 1\nwhat = \"busy\"")).contains("belongs to late"));
-        assert!(complaint(&event("at_ms = 1\nwhat = \"bus-off\"")).contains("reserved"));
         assert!(complaint(&event("at_ms = 1\nwhat = \"sulk\"")).contains("unknown variant `sulk`"));
         assert!(complaint(&event("at_ms = 1\nwhat = \"lost\"\nwhy = 1")).contains("unknown field `why`"));
     }

@@ -45,11 +45,20 @@ pub trait MachinePort: Port {
     fn half_close(&mut self) -> impl Future<Output = io::Result<()>> + Send {
         std::future::ready(Ok(()))
     }
+
+    /// Whether it is a place on a bus, which can be lost.
+    fn is_on_bus(&self) -> bool {
+        false
+    }
 }
 
 impl MachinePort for FolderPort {}
 
-impl MachinePort for CanPort {}
+impl MachinePort for CanPort {
+    fn is_on_bus(&self) -> bool {
+        true
+    }
+}
 
 impl<W: AsyncRead + AsyncWrite + Unpin + Send> MachinePort for WirePort<W> {
     async fn half_close(&mut self) -> io::Result<()> {
@@ -111,7 +120,11 @@ where
                 }
                 let (pieces, _) = shared.attend(|controller| station.cycle(controller));
                 for piece in pieces {
-                    let _ = shared.damaged(&mut port, piece, false).await; // the bus may be away for a while
+                    // Other errors pass: the bus may be away for a while.
+                    let sent = shared.damaged(&mut port, piece, false).await;
+                    if sent.is_err_and(|error| error.kind() == io::ErrorKind::NotConnected) {
+                        return;
+                    }
                 }
             }
         }
@@ -177,6 +190,9 @@ impl Shared {
         let (arriving, ms, trouble) = self.meet(piece, takes_time);
         if ms > 0 {
             tokio::time::sleep(Duration::from_millis(ms)).await;
+        }
+        if trouble == Some(Trouble::BusOff) && port.is_on_bus() {
+            return Err(io::ErrorKind::NotConnected.into());
         }
         if trouble == Some(Trouble::HalfClose) {
             port.half_close().await?;

@@ -25,6 +25,8 @@ pub enum Trouble {
     Busy,
     /// The machine closes its writing side instead of answering.
     HalfClose,
+    /// The machine's controller leaves the bus, and is back a moment later; a machine on no bus does not notice.
+    BusOff,
     /// Power off and on: the answer is lost, with all that is volatile.
     Reboot,
     /// Emergency stop, while an answer goes out: its state bit is set from then on.
@@ -52,7 +54,11 @@ impl Trouble {
             Trouble::OtherProgram => model.rename_program("SOMETHING-ELSE"),
             Trouble::Running => model.set_between_parts(false),
             Trouble::Frozen => model.frozen = true,
-            Trouble::Reply(_) | Trouble::Cut { .. } | Trouble::Busy | Trouble::HalfClose => {}
+            Trouble::Reply(_)
+            | Trouble::Cut { .. }
+            | Trouble::Busy
+            | Trouble::HalfClose
+            | Trouble::BusOff => {}
         }
     }
 
@@ -85,6 +91,7 @@ impl fmt::Display for Trouble {
             Trouble::Cut { bytes } => write!(f, "cut after {bytes} bytes"),
             Trouble::Busy => write!(f, "busy"),
             Trouble::HalfClose => write!(f, "writing side closed"),
+            Trouble::BusOff => write!(f, "bus-off"),
             Trouble::Reboot => write!(f, "power off and on"),
             Trouble::EmergencyStop { bytes } => write!(f, "emergency stop, cut after {bytes} bytes"),
             Trouble::Edit => write!(f, "another table entered at the screen"),
