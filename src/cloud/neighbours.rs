@@ -96,10 +96,11 @@ mod tests {
     }
 
     fn brute_nearest(cloud: &PointCloud, p: &Point3<f64>, n: usize) -> Vec<(u32, f64)> {
-        let mut all: Vec<_> = (0..cloud.len()).map(|i| (i as u32, squared(cloud, i, p).sqrt())).collect();
+        // By the squares: two that differ may have the same root.
+        let mut all: Vec<_> = (0..cloud.len()).map(|i| (i as u32, squared(cloud, i, p))).collect();
         all.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
         all.truncate(n);
-        all
+        all.into_iter().map(|(index, squared)| (index, squared.sqrt())).collect()
     }
 
     fn agree(cloud: &PointCloud, p: &Point3<f64>, radius: f64, n: usize) {
@@ -141,6 +142,13 @@ mod tests {
                 [0.0, 1.0, 2.0, 5.0].iter().for_each(|&r| agree(&cloud, &points[i], r, 12));
             }
         }
+    }
+
+    #[test]
+    fn squares_that_differ_by_less_than_their_roots_can_tell() {
+        let points =
+            [[-12.0, 5.0, -2.0], [-13.0, -10.0, 0.0], [3.0, 3.0, -1.0]].map(|p| Point3::from(p) * 0.1);
+        agree(&PointCloud::from_points(&points), &points[0], 0.0, 2);
     }
 
     #[test]
