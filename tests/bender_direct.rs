@@ -7,7 +7,8 @@ use benderd::bender::{Intent, IntentLog, Job, Link, LogError, Operation, Outcome
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::Door;
-use benderd::sim::faults::{ReplyFault, WireFaults};
+use benderd::sim::reply_fault::ReplyFault;
+use benderd::sim::trouble::WireFaults;
 use benderd::tube::{CommandRow, CommandTable};
 
 struct Nothing;

@@ -9,9 +9,10 @@ use benderd::bender::{Bender as _, Device, Link, LinkError, Profile, TableId, Tr
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::{Door, Speech};
-use benderd::sim::faults::{ReplyFault, WireFaults};
 use benderd::sim::frames::Framing;
 use benderd::sim::pty::machine_end;
+use benderd::sim::reply_fault::ReplyFault;
+use benderd::sim::trouble::WireFaults;
 use benderd::trial::deliveries::{Ending, Totals, in_memory, real, run};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
 use tokio::sync::mpsc;

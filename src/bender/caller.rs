@@ -16,6 +16,15 @@ use super::wire::crc_of;
 /// must be asked.
 const LONGEST_WAIT_SHARE: u64 = 4;
 
+/// How often a machine that says "busy" is asked again.
+pub const BUSY_RETRIES: u32 = 3;
+
+/// How often what was garbled or lost is asked again, where that may be.
+pub const RETRIES: u32 = 2;
+
+/// A constant that is wrong so many times in a row is no damage on the way: it is another machine.
+pub const FOREIGN_LOOKS: usize = 2;
+
 /// A connection of the kind `C`, or none.
 pub struct Caller<C> {
     endpoint: String,
@@ -74,11 +83,8 @@ impl<C> Caller<C> {
 
     /// The connection, which [`Caller::next`] promised.
     pub fn connection(&mut self) -> Result<&mut C, LinkError> {
-        if self.connection.is_none() {
-            return Err(self.resting());
-        }
-        let resting = self.resting();
-        self.connection.as_mut().ok_or(resting)
+        let Caller { connection, contact, endpoint, since, .. } = self;
+        connection.as_mut().ok_or_else(|| resting(endpoint, contact, *since))
     }
 
     /// A call that was cancelled has left the contact waiting for its answer.
@@ -97,7 +103,7 @@ impl<C> Caller<C> {
                 Action::Refuse { until_ms } if matches!(self.contact.state(), State::Silent { .. }) => {
                     sleep_until(self.at(until_ms)).await;
                 }
-                _ => return Err(self.resting()),
+                _ => return Err(resting(&self.endpoint, &self.contact, self.since)),
             }
         }
     }
@@ -147,19 +153,16 @@ impl<C> Caller<C> {
         }
         Err(LinkError::Outdated { endpoint: self.endpoint.clone(), what: what() })
     }
+}
 
-    fn resting(&self) -> LinkError {
-        let now_ms = self.now_ms();
-        let (endpoint, failures) = (self.endpoint.clone(), self.contact.failures());
-        match self.contact.state() {
-            State::Faulted { until_ms } => {
-                LinkError::Foreign { endpoint, ms: until_ms.saturating_sub(now_ms) }
-            }
-            State::Away { retry_ms } => {
-                LinkError::Resting { endpoint, failures, ms: retry_ms.saturating_sub(now_ms) }
-            }
-            _ => LinkError::Resting { endpoint, failures, ms: 0 },
-        }
+/// Why nothing can be asked now.
+fn resting(endpoint: &str, contact: &Contact, since: Instant) -> LinkError {
+    let left_ms = |until_ms: u64| until_ms.saturating_sub(millis(since.elapsed()));
+    let (endpoint, failures) = (endpoint.to_owned(), contact.failures());
+    match contact.state() {
+        State::Faulted { until_ms } => LinkError::Foreign { endpoint, ms: left_ms(until_ms) },
+        State::Away { retry_ms } => LinkError::Resting { endpoint, failures, ms: left_ms(retry_ms) },
+        _ => LinkError::Resting { endpoint, failures, ms: 0 },
     }
 }
 

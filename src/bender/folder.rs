@@ -1,5 +1,5 @@
 //! The shared folder as a protocol: each exchange is one command file and one answer file (protocols/shared-folder.md). Pure but for
-//! opening the port.
+//! opening the port and the first number.
 //!
 //! Over `folder_port` and `folder_text`, under `table_link`.
 

@@ -8,7 +8,7 @@ use std::future::Future;
 use thiserror::Error;
 
 use super::profile::Profile;
-use super::wire::{Staged, Status, TableId};
+use super::wire::{Staged, Status, TableId, crc_of};
 
 /// Why a request did not do what was asked. Whether a write was applied is then not known.
 #[derive(Debug, Error)]
@@ -114,6 +114,20 @@ pub struct ActiveTable {
     pub status: Status,
     /// The active payload, as long as its own bend count says.
     pub payload: Vec<u8>,
+}
+
+impl ActiveTable {
+    /// As long as its payload is the one that the status names; else why not.
+    pub(super) fn checked(status: Status, payload: Vec<u8>) -> Result<ActiveTable, String> {
+        let crc = crc_of(&payload);
+        if crc == status.active.crc {
+            return Ok(ActiveTable { status, payload });
+        }
+        Err(format!(
+            "the active rows have CRC {crc:08X}, the machine says {}: caught in a change, or damaged",
+            status.active
+        ))
+    }
 }
 
 /// A machine that takes tables by stage, verify, commit.

@@ -1,5 +1,6 @@
 //! A machine whose registers hold a staging area, a commit word and a status: the reference map and its like.
 
+use super::caller::FOREIGN_LOOKS;
 use super::contact::{Event, RulesError};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus_client::ModbusClient;
@@ -7,10 +8,7 @@ use super::open::Opener;
 use super::plan;
 use super::profile::Profile;
 use super::registers::{ModbusMap, decode_status};
-use super::wire::{Staged, Status, TableId, commit_image, crc_of, payload_bytes, staging_image};
-
-/// A constant that is wrong so many times in a row is no damage on the way: it is another machine.
-const FOREIGN_LOOKS: usize = 2;
+use super::wire::{Staged, Status, TableId, commit_image, payload_bytes, staging_image};
 
 /// A bender behind Modbus.
 pub struct ModbusLink {
@@ -99,13 +97,6 @@ impl Bender for ModbusLink {
         payload.extend(
             self.client.read(plan::reads(&self.map, plan::rows(&self.profile, &self.map), rows)).await?,
         );
-        let crc = crc_of(&payload);
-        if crc != status.active.crc {
-            return Err(self.client.nonsense(format!(
-                "the active rows have CRC {crc:08X}, the machine says {}: caught in a change, or damaged",
-                status.active
-            )));
-        }
-        Ok(ActiveTable { status, payload })
+        ActiveTable::checked(status, payload).map_err(|why| self.client.nonsense(why))
     }
 }

@@ -14,7 +14,7 @@ use tokio::time::{Duration, Instant, sleep_until, timeout_at};
 use tokio_modbus::client::{Client as _, rtu};
 use tokio_modbus::{ExceptionCode, Request, Response, Slave};
 
-use super::caller::{Caller, Next, millis};
+use super::caller::{BUSY_RETRIES, Caller, Next, RETRIES, millis};
 use super::contact::{Event, RulesError};
 use super::link::LinkError;
 use super::open::{Connection, Opener, open};
@@ -22,12 +22,6 @@ use super::plan;
 use super::profile::Profile;
 use super::recording::Frames;
 use super::transport::Transport;
-
-/// How often a device that says "busy" is asked again.
-const BUSY_RETRIES: u32 = 3;
-
-/// How often what a line garbled or lost is asked again.
-const LINE_RETRIES: u32 = 2;
 
 /// One unit behind Modbus.
 pub struct ModbusClient {
@@ -123,7 +117,7 @@ impl ModbusClient {
     async fn call_patiently(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
         let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
         let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
-        let line_retries = if self.profile.transport.line().is_some() { LINE_RETRIES } else { 0 };
+        let line_retries = if self.profile.transport.line().is_some() { RETRIES } else { 0 };
         let (mut patience, mut repeats) = (BUSY_RETRIES, line_retries);
         loop {
             match self.call(request.clone()).await {

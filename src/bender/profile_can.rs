@@ -120,15 +120,11 @@ pub fn parse_canopen(doc: &Document, raw: &RawCanopen) -> Result<CanopenSettings
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bender::profile_file::testing::complaint_of as complaint;
     use crate::bender::{Profile, Transport};
 
     const CAN: &str = include_str!("../../protocols/reference-can.toml");
     const CANOPEN: &str = include_str!("../../protocols/reference-canopen.toml");
-
-    fn complaint(text: &str, from: &str, to: &str) -> String {
-        assert!(text.contains(from), "{from:?}");
-        Profile::parse(&Document::new("p.toml", text.replacen(from, to, 1))).unwrap_err().to_string()
-    }
 
     #[test]
     fn canopen_is_read_and_its_complaints_name_the_key() {

@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::profile::{Deadlines, Profile, StateBit, TableFormat, WordOrder};
 use super::profile_can::check_can;
 use super::profile_modbus::check_areas;
-use super::profile_raw::{RawDeadlines, RawLimits, RawProfile, RawStateBit, RawTable};
+use super::profile_raw::{RawConstants, RawDeadlines, RawLimits, RawProfile, RawStateBit, RawTable};
 use super::profile_transport::{RawMap, Sections, parse_transport};
 use super::transport::Transport;
 use crate::config::{At, ConfigError, Document};
@@ -84,31 +84,14 @@ impl Profile {
             check_can(doc, characters, &raw.limits.max_bends)?;
         }
         let transport = parse_transport(doc, &raw.transport, &sections, &table)?;
-        let layout = match (&raw.constants.layout, transport.direct()) {
-            (Some(layout), None) => integer(doc, layout, "constants.layout", 0..=0xffff)? as u16,
-            (None, Some(_)) => 0,
-            (None, None) => {
-                return Err(incomplete(
-                    doc,
-                    &raw.constants.identification,
-                    "constants.identification",
-                    "layout",
-                ));
-            }
-            (Some(layout), Some(_)) => return Err(useless(doc, layout, "constants.layout")),
-        };
+        let (identification, layout) = parse_constants(doc, &raw.constants, &transport)?;
         let deadlines = parse_deadlines(doc, &raw.deadlines, &transport)?;
         let profile = Profile {
             name: text(doc, &raw.name, "name", 32)?,
             description: text(doc, &raw.description, "description", 200)?,
             endpoint: endpoint(doc, &raw.endpoint, &transport)?,
             transport,
-            identification: integer(
-                doc,
-                &raw.constants.identification,
-                "constants.identification",
-                1..=u32::MAX.into(),
-            )? as u32,
+            identification,
             layout,
             limits: parse_limits(doc, &raw.limits, &table)?,
             table,
@@ -119,6 +102,24 @@ impl Profile {
             check_areas(doc, registers, &profile, map)?;
         }
         Ok(profile)
+    }
+}
+
+/// Identification and layout.
+fn parse_constants(
+    doc: &Document,
+    raw: &RawConstants,
+    transport: &Transport,
+) -> Result<(u32, u16), ConfigError> {
+    let identification = |most| integer(doc, &raw.identification, "constants.identification", 1..=most);
+    match (&raw.layout, transport.direct()) {
+        (Some(layout), None) => {
+            let layout = integer(doc, layout, "constants.layout", 0..=0xffff)? as u16;
+            Ok((identification(u32::MAX.into())? as u32, layout))
+        }
+        (None, Some(_)) => Ok((identification(u32::MAX.into())? as u32, 0)),
+        (None, None) => Err(incomplete(doc, &raw.identification, "constants.identification", "layout")),
+        (Some(layout), Some(_)) => Err(useless(doc, layout, "constants.layout")),
     }
 }
 
@@ -302,19 +303,32 @@ fn endpoint(doc: &Document, value: &At<String>, transport: &Transport) -> Result
     Err(doc.value_error(value.span(), "endpoint", format!("{found:?}"), transport.form()))
 }
 
+/// What tests of the profile's parts share.
+#[cfg(test)]
+pub(super) mod testing {
+    use super::*;
+
+    /// A profile's text.
+    pub fn parse(text: &str) -> Result<Profile, String> {
+        Profile::parse(&Document::new("p.toml", text)).map_err(|e| e.to_string())
+    }
+
+    /// What is said of it when something in it is changed.
+    pub fn complaint_of(text: &str, from: &str, to: &str) -> String {
+        assert!(text.contains(from), "the shipped profile no longer contains {from:?}");
+        parse(&text.replacen(from, to, 1)).unwrap_err()
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use super::testing::{complaint_of, parse};
     use super::*;
 
     const TEXT: &str = SHIPPED[0].1;
 
-    fn parse(text: &str) -> Result<Profile, String> {
-        Profile::parse(&Document::new("p.toml", text)).map_err(|e| e.to_string())
-    }
-
     fn complaint(from: &str, to: &str) -> String {
-        assert!(TEXT.contains(from), "the shipped profile no longer contains {from:?}");
-        parse(&TEXT.replacen(from, to, 1)).unwrap_err()
+        complaint_of(TEXT, from, to)
     }
 
     #[test]

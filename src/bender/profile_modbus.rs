@@ -213,17 +213,12 @@ pub fn check_areas(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use crate::bender::profile_file::testing::{complaint_of, parse};
 
     const TEXT: &str = include_str!("../../protocols/reference-modbus.toml");
 
-    fn parse(text: &str) -> Result<Profile, String> {
-        Profile::parse(&Document::new("p.toml", text)).map_err(|e| e.to_string())
-    }
-
     fn complaint(from: &str, to: &str) -> String {
-        assert!(TEXT.contains(from), "the shipped profile no longer contains {from:?}");
-        parse(&TEXT.replacen(from, to, 1)).unwrap_err()
+        complaint_of(TEXT, from, to)
     }
 
     #[test]
@@ -242,10 +237,7 @@ mod tests {
     #[test]
     fn a_map_without_a_staging_area_has_its_own_section_and_none_of_the_others() {
         const TEN: &str = include_str!("../../protocols/ten-row.toml");
-        let complaint = |from: &str, to: &str| {
-            assert!(TEN.contains(from), "{from:?}");
-            parse(&TEN.replacen(from, to, 1)).unwrap_err()
-        };
+        let complaint = |from, to| complaint_of(TEN, from, to);
         assert!(parse(TEN).is_ok());
         let text = complaint("max_write_registers = 123", "max_write_registers = 9");
         assert!(text.contains("max_write_registers = 9, allowed is 10 to 123"), "{text}");

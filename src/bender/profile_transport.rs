@@ -181,11 +181,7 @@ fn parse_serial(doc: &Document, raw: &RawSerial) -> Result<SerialSettings, Confi
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bender::Profile;
-
-    fn parse(text: &str) -> Result<Profile, String> {
-        Profile::parse(&Document::new("p.toml", text)).map_err(|e| e.to_string())
-    }
+    use crate::bender::profile_file::testing::{complaint_of, parse};
 
     const RTU: &str = include_str!("../../protocols/reference-rtu.toml");
 
@@ -200,10 +196,7 @@ mod tests {
 
     #[test]
     fn what_a_transport_lacks_or_has_no_use_for_is_named() {
-        let complaint = |from: &str, to: &str| {
-            assert!(RTU.contains(from), "{from:?}");
-            parse(&RTU.replacen(from, to, 1)).unwrap_err()
-        };
+        let complaint = |from, to| complaint_of(RTU, from, to);
         let text = complaint("\"modbus-rtu\"", "\"modbus-tcp\"");
         assert!(
             text.contains("transport = \"modbus-tcp\", allowed is without [line] and [serial]"),

@@ -3,22 +3,13 @@
 
 use tokio::time::{Duration, Instant, timeout_at};
 
-use super::caller::{Caller, Next, millis};
+use super::caller::{BUSY_RETRIES, Caller, FOREIGN_LOOKS, Next, RETRIES, millis};
 use super::contact::{Event as Happened, RulesError};
 use super::exchange::{Action, Ask, Event, Exchange, Failure, Port, Protocol};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::profile::Profile;
 use super::status_image::decode_status_image;
-use super::wire::{Staged, Status, TableId, crc_of, staging_image};
-
-/// How often a machine that says "busy" is asked again.
-const BUSY_RETRIES: u32 = 3;
-
-/// How often what was garbled or lost is asked again.
-const RETRIES: u32 = 2;
-
-/// A constant that is wrong so many times in a row is no damage on the way: it is another machine.
-const FOREIGN_LOOKS: usize = 2;
+use super::wire::{Staged, Status, TableId, staging_image};
 
 /// A bender behind a protocol.
 pub struct TableLink<P: Protocol> {
@@ -208,13 +199,6 @@ impl<P: Protocol> Bender for TableLink<P> {
             return Ok(ActiveTable { status, payload: Vec::new() });
         }
         let payload = self.ask_patiently(&Ask::Recall).await?;
-        let crc = crc_of(&payload);
-        if crc != status.active.crc {
-            return Err(self.nonsense(format!(
-                "the active rows have CRC {crc:08X}, the machine says {}: caught in a change, or damaged",
-                status.active
-            )));
-        }
-        Ok(ActiveTable { status, payload })
+        ActiveTable::checked(status, payload).map_err(|why| self.nonsense(why))
     }
 }

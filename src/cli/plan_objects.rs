@@ -11,7 +11,7 @@ pub fn write(out: &mut String, profile: &Profile) -> Result {
     let [status, stage, read_back, commit, recall] = match &profile.transport {
         Transport::SerialTable(..) => serial(payload),
         Transport::Folder(number) => folder(*number),
-        Transport::Can(can) => messages(can, bends),
+        Transport::Can(can) => messages(profile, can),
         Transport::Canopen(canopen) => objects(canopen, payload),
         // Registers have a plan of their own.
         Transport::ModbusTcp(_) | Transport::ModbusRtu(..) | Transport::ModbusRtuOverTcp(..) => return Ok(()),
@@ -53,13 +53,13 @@ fn folder(number: u16) -> [String; 5] {
     ]
 }
 
-fn messages(can: &CanSettings, bends: usize) -> [String; 5] {
-    let contract = &can.contract;
+fn messages(profile: &Profile, can: &CanSettings) -> [String; 5] {
+    let (contract, bends) = (&can.contract, profile.limits.max_bends);
     let [state, status, item, commit] =
         [&contract.state, &contract.status, &contract.item.0, &contract.commit.0]
             .map(|m| format!("{} {}", m.id, m.name));
     // Revision, CRC, bend count, last length, the program's name; then rows.
-    let head = 4 + contract.program_items();
+    let head = 4 + profile.table.program_bytes / 4;
     let items = |head: usize| match &contract.row {
         Some((row, _)) => format!("{head} times {item}, {bends} times {} {}", row.id, row.name),
         None => format!("{} times {item}", head + 3 * bends),

@@ -120,18 +120,13 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
         report.result = Ending::Delivered(Outcome::Rejected { reasons: refusal });
         return finish(args, &report);
     }
-    let mut operation = Operation::New;
-    if args.correct {
-        let mut journal = open_journal(args.journal.as_deref())?;
-        let Some(last) = JournalledIntents::new(&mut journal, &endpoint).last_applied(&program)? else {
-            bail!(
-                "--correct: nothing that was committed to {endpoint} for program {program:?} is in {}; leave it out to make the rows anew",
-                journal.file()
-            );
-        };
-        operation = Operation::Correct { last };
-    }
-    let mut journal = if args.dry_run { None } else { Some(open_journal(args.journal.as_deref())?) };
+    let reads_journal = args.correct || !args.dry_run;
+    let mut journal = if reads_journal { Some(open_journal(args.journal.as_deref())?) } else { None };
+    let operation = match &mut journal {
+        Some(journal) if args.correct => last_committed(journal, &endpoint, &program)?,
+        _ => Operation::New,
+    };
+    let mut journal = journal.filter(|_| !args.dry_run);
     report.journal = journal.as_ref().map(|j| j.file().to_owned());
     if !args.json {
         report.notes.iter().for_each(|note| say(&format!("note      {note}\n")));
@@ -141,6 +136,17 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
     finish(args, &report)
+}
+
+/// A correction of what was committed last.
+fn last_committed(journal: &mut Journal, endpoint: &str, program: &str) -> anyhow::Result<Operation> {
+    match JournalledIntents::new(journal, endpoint).last_applied(program)? {
+        Some(last) => Ok(Operation::Correct { last }),
+        None => bail!(
+            "--correct: nothing that was committed to {endpoint} for program {program:?} is in {}; leave it out to make the rows anew",
+            journal.file()
+        ),
+    }
 }
 
 /// Says how it ended.

@@ -1,4 +1,4 @@
-//! `benderd simulate bender`: a bender on a socket or a serial line, until Ctrl-C or SIGTERM.
+//! `benderd simulate bender`: a bender on whatever link its profile names, until Ctrl-C or SIGTERM.
 
 use std::path::PathBuf;
 
@@ -10,8 +10,9 @@ use crate::bender::Profile;
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
 use crate::sim::door::Door;
-use crate::sim::faults::{Fault, WireFaults};
+use crate::sim::faults::Fault;
 use crate::sim::script;
+use crate::sim::trouble::WireFaults;
 
 /// Arguments of `benderd simulate bender`.
 #[derive(Debug, clap::Args)]
@@ -19,8 +20,8 @@ pub struct Args {
     /// What kind of machine: a shipped profile's name or a profile file.
     #[arg(long, default_value = "reference-modbus")]
     profile: String,
-    /// Where to be reached [default: the profile's endpoint]: HOST:PORT, port 0 takes a free one; for a serial profile a path:
-    /// the device there, or a pseudo terminal that is made under this name.
+    /// Where to be reached [default: the profile's endpoint]: HOST:PORT, port 0 takes a free one; for a serial profile a path: the
+    /// device there, or a pseudo terminal that is made under this name; a folder; a CAN interface.
     #[arg(long, value_name = "ADDRESS")]
     on: Option<String>,
     /// Name of the loaded program.

@@ -1,4 +1,4 @@
-//! The simulated bender on its links: takes requests off a wire and answers them, with faults on demand.
+//! The simulated bender on its links: its program cycle, and a station for whoever comes through its door.
 
 use std::io;
 use std::sync::{Arc, Mutex};
@@ -12,13 +12,14 @@ use tokio::time::Instant;
 use super::bender::{MachineEvent, MachineModel};
 use super::can_station::CanStation;
 use super::door::{Door, Speech};
-use super::faults::{Fault, When, WireFaults};
+use super::faults::Fault;
 use super::folder_station::FolderStation;
 use super::frames::Framing;
 use super::modbus_station::ModbusStation;
 use super::sdo_server::SdoServer;
 use super::serial_station::SerialStation;
 use super::serve::{CYCLE, Shared, WirePort, lock, serve};
+use super::trouble::{When, WireFaults};
 use crate::bender::Transport;
 
 /// A bus that was lost is tried again after this.

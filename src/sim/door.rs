@@ -1,4 +1,4 @@
-//! Where a simulated bender is reached: a socket, a serial line, a wire in memory.
+//! Where a simulated bender is reached: a socket, a serial line, a folder, a bus, a wire in memory.
 
 use std::io;
 use std::path::Path;
@@ -32,7 +32,7 @@ pub enum Door {
 pub type BusDoor = Box<dyn FnMut() -> io::Result<CanPort> + Send>;
 
 /// How long a full bus is waited for.
-const BUS_PATIENCE: Duration = Duration::from_secs(1);
+pub const BUS_PATIENCE: Duration = Duration::from_secs(1);
 
 /// What is spoken on a wire of bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,20 +59,18 @@ impl Door {
     /// Opens where a machine of this profile is reached, and what must be kept meanwhile: a host and port, the path of a serial
     /// port ([`machine_end`]), a folder, a CAN interface. Must be called inside a tokio runtime.
     pub async fn open(profile: &Profile, on: &str) -> io::Result<(Door, Option<Kept>)> {
+        let line = |speech, settings| -> io::Result<_> {
+            let end = machine_end(Path::new(on), settings)?;
+            Ok((Door::Line(speech, Box::new(end.wire), on.to_owned()), end.kept))
+        };
         Ok(match &profile.transport {
             Transport::ModbusTcp(_) => (Door::Socket(Framing::Tcp, TcpListener::bind(on).await?), None),
             Transport::ModbusRtuOverTcp(..) => {
                 (Door::Socket(Framing::Rtu, TcpListener::bind(on).await?), None)
             }
             Transport::Can(_) | Transport::Canopen(_) => (Door::interface(profile, on)?, None),
-            Transport::ModbusRtu(.., settings) => {
-                let end = machine_end(Path::new(on), settings)?;
-                (Door::Line(Speech::Modbus(Framing::Rtu), Box::new(end.wire), on.to_owned()), end.kept)
-            }
-            Transport::SerialTable(unit, _, settings) => {
-                let end = machine_end(Path::new(on), settings)?;
-                (Door::Line(Speech::SerialTable(*unit), Box::new(end.wire), on.to_owned()), end.kept)
-            }
+            Transport::ModbusRtu(.., settings) => line(Speech::Modbus(Framing::Rtu), settings)?,
+            Transport::SerialTable(unit, _, settings) => line(Speech::SerialTable(*unit), settings)?,
             Transport::Folder(number) => (Door::folder(profile, *number, on)?, None),
         })
     }

@@ -3,8 +3,6 @@
 use std::str::FromStr;
 
 use super::bender::MachineModel;
-pub use super::reply_fault::{Damaged, ReplyFault};
-pub use super::trouble::{Trouble, When, WireFaults};
 
 /// A way to misbehave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

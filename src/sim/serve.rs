@@ -8,8 +8,10 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 
 use super::bender::MachineModel;
-use super::faults::{Damaged, Fault, ReplyFault, Trouble, When, WireFaults};
+use super::faults::Fault;
+use super::reply_fault::{Damaged, ReplyFault};
 use super::station::{Controller, Station};
+use super::trouble::{Trouble, When, WireFaults};
 use crate::bender::can::CanPort;
 use crate::bender::{FolderPort, Port};
 

@@ -20,16 +20,13 @@ use crate::bender::{
 };
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
-use crate::sim::door::{Door, Speech};
-use crate::sim::faults::{Trouble, When, WireFaults};
+use crate::sim::door::{BUS_PATIENCE, Door, Speech};
 use crate::sim::pty::Kept;
+use crate::sim::trouble::{Trouble, When, WireFaults};
 use crate::tube::{CommandRow, CommandTable};
 
 /// Room for bytes on a wire in memory.
 const WIRE_BYTES: usize = 4096;
-
-/// How long a full bus is waited for.
-const BUS_PATIENCE: Duration = Duration::from_secs(1);
 
 /// The program that the machine has loaded.
 const PROGRAM: &str = "P1";

@@ -8,6 +8,7 @@ mod memory;
 mod socket;
 #[cfg(test)]
 mod tests;
+mod watched;
 
 pub use bus::{Bus, BusOpener, CanPort, open_port};
 pub use frame::{Condition, Frame, FrameId, Heard};

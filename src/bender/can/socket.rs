@@ -11,6 +11,7 @@ use tokio::io::unix::AsyncFd;
 
 use super::bus::{Bus, has_no_room};
 use super::frame::{Condition, Frame, FrameId, Heard};
+use super::watched::watched;
 
 /// Size of the kernel's structure for a CAN FD frame; an interface that carries them says so by it.
 const FD_MTU: u32 = 72;
@@ -31,10 +32,7 @@ impl Socket {
         }
         socket.set_error_filter_accept_all().map_err(explained)?;
         socket.set_nonblocking(true).map_err(explained)?;
-        // SAFETY: the socket gives the same descriptor as long as it lives, and closes it when it is dropped, which is after the
-        // `AsyncFd` that owns it was taken from the reactor.
-        let fd = unsafe { AsyncFd::register(socket) }?;
-        Ok(Socket { fd, interface: interface.to_owned() })
+        Ok(Socket { fd: watched(socket)?, interface: interface.to_owned() })
     }
 }
 

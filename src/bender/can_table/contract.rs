@@ -57,11 +57,6 @@ pub struct Contract {
 }
 
 impl Contract {
-    /// Items that a program's name takes, four characters each.
-    pub fn program_items(&self) -> usize {
-        PROGRAM_BYTES / 4
-    }
-
     /// The messages in a database, for tables of this format.
     pub fn of(database: &Database, table: &TableFormat, fd: bool) -> Result<Contract, DbcError> {
         let message = |name: &str, signals: &[(&str, Steps)]| {
