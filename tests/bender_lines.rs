@@ -5,15 +5,20 @@
 use std::path::Path;
 use std::time::Duration;
 
-use benderd::bender::{Bender as _, Device, Link, LinkError, Profile, TableId, Transport, Wire};
+use benderd::bender::{
+    Bender as _, Device, Intent, IntentLog, Job, Link, LinkError, LogError, Operation, Outcome, Profile,
+    TableId, Transport, Wire, deliver,
+};
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::{Door, Speech};
+use benderd::sim::faults::Fault;
 use benderd::sim::frames::Framing;
 use benderd::sim::pty::machine_end;
 use benderd::sim::reply_fault::ReplyFault;
 use benderd::sim::trouble::WireFaults;
 use benderd::trial::deliveries::{Ending, Totals, in_memory, real, run};
+use benderd::tube::{CommandRow, CommandTable};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
 use tokio::sync::mpsc;
 use tokio_modbus::Slave;
@@ -199,6 +204,46 @@ async fn a_table_is_delivered_through_a_pseudo_terminal() {
         assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
         drop(kept);
         assert!(!path.is_symlink(), "its name is taken away");
+    }
+}
+
+struct Nothing;
+
+impl IntentLog for Nothing {
+    fn intent(&mut self, _: &Intent) -> Result<(), LogError> {
+        Ok(())
+    }
+
+    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
+        Ok(())
+    }
+}
+
+/// A line and a folder cannot be cut: the machine is heard again, and what became of the commit is found out by reading.
+#[tokio::test]
+async fn a_commit_that_is_not_answered_on_a_line_or_in_a_folder_is_found_out() {
+    for (name, fault, applied) in [
+        ("reference-rtu", Fault::DropAfterApply, true),
+        ("reference-serial", Fault::DropBeforeApply, false),
+        ("reference-folder", Fault::DropAfterApply, true),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let profile = quick(name);
+        let (mut ends, _kept) = real(&profile, folder.path()).await.unwrap();
+        let model = MachineModel::new(profile, "P1", 1);
+        let _bender = SimulatedBender::start(ends.door, model, Some(fault), |_| ()).unwrap();
+        let row = CommandRow { length_mm: 100.0, rotation_rad: 0.0, angle_rad: 1.0 };
+        let table = CommandTable { bends: vec![row], last_length_mm: 50.0 };
+        let job = Job {
+            program: "P1".into(),
+            table,
+            expected_active: None,
+            operation: Operation::New,
+            approved: false,
+        };
+        let outcome = deliver(&mut ends.link, &job, &mut Nothing).await;
+        assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
+        assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
     }
 }
 

@@ -74,7 +74,7 @@ fn commands(script: &mut Script) {
         }
         let command = read::<Command>(&text);
         let mut mute = false;
-        let mut controller = Controller { model: &mut model, fault: None, mute: &mut mute, hangs_up: false };
+        let mut controller = Controller::new(&mut model, None, &mut mute);
         let answers = station.hear(Letter { text, table }, &mut controller);
         assert!(answers.len() <= 1);
         for Letter { text, table: bytes } in answers {

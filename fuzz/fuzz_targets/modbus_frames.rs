@@ -73,8 +73,7 @@ impl Machine {
             assert!(self.sent.windows(frame.len()).any(|sent| sent == frame), "nobody sent {heard:?}");
         }
         let mut mute = false;
-        let mut controller =
-            Controller { model: &mut self.model, fault: None, mute: &mut mute, hangs_up: false };
+        let mut controller = Controller::new(&mut self.model, None, &mut mute);
         let answers = self.station.hear(piece.to_vec(), &mut controller);
         assert!(answers.len() <= heard.len());
         for answer in answers {

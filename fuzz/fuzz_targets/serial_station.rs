@@ -24,8 +24,7 @@ struct Machine {
 impl Machine {
     fn hear(&mut self, piece: &[u8]) -> Vec<Frame> {
         let mut mute = false;
-        let mut controller =
-            Controller { model: &mut self.model, fault: None, mute: &mut mute, hangs_up: false };
+        let mut controller = Controller::new(&mut self.model, None, &mut mute);
         let answers = self.station.hear(piece.to_vec(), &mut controller);
         answers.iter().map(|a| self.answer(a)).collect()
     }

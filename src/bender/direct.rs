@@ -5,6 +5,7 @@
 //! operator's approval. The rows stand in three columns of the same length; what is behind the last bend is 0. The machine knows
 //! neither the program nor the length after the last bend: both are 0 in the payload that stands for its table here.
 
+use super::caller::FOREIGN_LOOKS;
 use super::contact::{Event, RulesError};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus_client::ModbusClient;
@@ -74,18 +75,26 @@ impl DirectLink {
         Ok(payload)
     }
 
-    async fn status(&mut self, crc: u32) -> Result<Status, LinkError> {
-        let at = self.map.identification;
-        let found = self.client.read(vec![Request { writes: false, address: at, registers: 1 }]).await?;
-        let found = u32::from(u16::from_be_bytes([found[0], found[1]]));
-        let expected = self.profile.identification;
-        if found != expected {
-            self.client.caller().perform(Event::Foreign);
-            return Err(self.client.nonsense(format!(
-                "register {at} holds {found} where profile {:?} expects {expected}: not this machine, or another die",
-                self.profile.name
-            )));
+    /// The constant is the profile's; one wrong look may be damage.
+    async fn identify(&mut self) -> Result<(), LinkError> {
+        let (at, expected) = (self.map.identification, self.profile.identification);
+        let mut found = 0;
+        for _ in 0..FOREIGN_LOOKS {
+            let bytes = self.client.read(vec![Request { writes: false, address: at, registers: 1 }]).await?;
+            found = u32::from(u16::from_be_bytes([bytes[0], bytes[1]]));
+            if found == expected {
+                return Ok(());
+            }
         }
+        self.client.caller().perform(Event::Foreign);
+        Err(self.client.nonsense(format!(
+            "register {at} holds {found} where profile {:?} expects {expected}: not this machine, or another die",
+            self.profile.name
+        )))
+    }
+
+    async fn status(&mut self, crc: u32) -> Result<Status, LinkError> {
+        self.identify().await?;
         let state = self.client.read_coils(self.map.state_coils, self.map.coils).await?;
         self.client.caller().has_seen();
         Ok(Status {

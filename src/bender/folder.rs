@@ -4,12 +4,12 @@
 //! Over `folder_port` and `folder_text`, under `table_link`.
 
 use std::io;
-use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::caller::millis;
 use super::exchange::{Action, Ask, Event, Exchange, Failure, Protocol};
-use super::folder_port::{FolderPort, Letter};
+use super::folder_port::{FolderPort, Letter, apart};
 use super::folder_text::{Answer, Command, Said, TableText, Verb, read, table, written};
 use super::profile::Profile;
 use super::recording::Frames;
@@ -77,8 +77,9 @@ impl Protocol for SharedFolder {
 
     async fn open(&mut self, endpoint: &str) -> io::Result<FolderPort> {
         let deadlines = &self.profile.deadlines;
-        let look = std::time::Duration::from_millis(deadlines.poll_ms);
-        let port = FolderPort::of_daemon(Path::new(endpoint), self.number, look, deadlines.transfer)?;
+        let (look, oldest) = (Duration::from_millis(deadlines.poll_ms), deadlines.transfer);
+        let (folder, number) = (PathBuf::from(endpoint), self.number);
+        let port = apart(move || FolderPort::of_daemon(&folder, number, look, oldest)).await?;
         Ok(port.recorded(self.frames.clone()))
     }
 }
@@ -116,7 +117,9 @@ impl Errand {
             Said::Garbled => return broken("the machine could not read the command".into()),
             _ if answer.sequence != self.sequence => return None,
             Said::Busy => return Some(Err(Failure::Busy)),
-            Said::Refused => return Some(Err(Failure::Refused("see the machine's screen".into()))),
+            Said::Refused => {
+                return Some(Err(Failure::Refused("the table is longer than its staging area".into())));
+            }
             Said::Done => {}
         }
         let image = || {

@@ -157,7 +157,10 @@ fn in_one_line(letter: &Letter) -> String {
     lines.join("; ") + &table.unwrap_or_default()
 }
 
-async fn apart<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
+/// Works on files where a share that hangs holds up nobody else.
+pub(super) async fn apart<T: Send + 'static>(
+    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+) -> io::Result<T> {
     spawn_blocking(work).await.map_err(io::Error::other)?
 }
 

@@ -14,9 +14,7 @@ use super::wire::{Staged, Status, TableId, crc_of};
 #[derive(Debug, Error)]
 pub enum LinkError {
     /// No connection.
-    #[error(
-        "{endpoint}: cannot connect: {why}; check that the machine is on and its address and port are right"
-    )]
+    #[error("{endpoint}: cannot connect: {why}; check that the machine is on and its address right")]
     Connect {
         /// Where.
         endpoint: String,

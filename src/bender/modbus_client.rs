@@ -118,14 +118,19 @@ impl ModbusClient {
         let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
         let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
         let line_retries = if self.profile.transport.line().is_some() { RETRIES } else { 0 };
-        let (mut patience, mut repeats) = (BUSY_RETRIES, line_retries);
+        let (mut patience, mut repeats, mut failed) = (BUSY_RETRIES, line_retries, None);
         loop {
             match self.call(request.clone()).await {
                 Err(LinkError::Exception { exception, .. }) if patience > 0 && busy.contains(&exception) => {
                     patience -= 1;
                     tokio::time::sleep(pause).await;
                 }
-                Err(LinkError::Timeout { .. } | LinkError::Broken { .. }) if repeats > 0 => repeats -= 1,
+                Err(error @ (LinkError::Timeout { .. } | LinkError::Broken { .. })) if repeats > 0 => {
+                    repeats -= 1;
+                    failed.get_or_insert(error);
+                }
+                // It cannot be asked again yet; why is what failed first.
+                Err(resting @ LinkError::Resting { .. }) => return Err(failed.unwrap_or(resting)),
                 other => return other,
             }
         }

@@ -117,7 +117,8 @@ fn parse_constants(
             let layout = integer(doc, layout, "constants.layout", 0..=0xffff)? as u16;
             Ok((identification(u32::MAX.into())? as u32, layout))
         }
-        (None, Some(_)) => Ok((identification(u32::MAX.into())? as u32, 0)),
+        // One register.
+        (None, Some(_)) => Ok((identification(0xffff)? as u32, 0)),
         (None, None) => Err(incomplete(doc, &raw.identification, "constants.identification", "layout")),
         (Some(layout), Some(_)) => Err(useless(doc, layout, "constants.layout")),
     }

@@ -247,6 +247,8 @@ mod tests {
         assert!(text.contains("direct.length = 65527, allowed is 0 to 65526"), "{text}");
         let text = complaint("identification = 60", "identification = 60\nlayout = 1");
         assert!(text.contains("constants.layout = 1, allowed is nothing"), "{text}");
+        let text = complaint("identification = 60", "identification = 65536");
+        assert!(text.contains("constants.identification = 65536, allowed is 1 to 65535"), "{text}");
         let text = complaint("rotation_sign", "program_characters = 32\nrotation_sign");
         assert!(text.contains("table.program_characters = 32, allowed is nothing"), "{text}");
         let text = parse(&TEXT.replacen("layout = 1", "", 1)).unwrap_err();

@@ -85,14 +85,19 @@ impl<P: Protocol> TableLink<P> {
     /// The same for what may be repeated: all but the commit.
     async fn ask_patiently(&mut self, ask: &Ask) -> Result<Vec<u8>, LinkError> {
         let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
-        let (mut patience, mut repeats) = (BUSY_RETRIES, RETRIES);
+        let (mut patience, mut repeats, mut failed) = (BUSY_RETRIES, RETRIES, None);
         loop {
             match self.ask(ask).await {
                 Err(LinkError::Busy { .. }) if patience > 0 => {
                     patience -= 1;
                     tokio::time::sleep(pause).await;
                 }
-                Err(LinkError::Timeout { .. } | LinkError::Broken { .. }) if repeats > 0 => repeats -= 1,
+                Err(error @ (LinkError::Timeout { .. } | LinkError::Broken { .. })) if repeats > 0 => {
+                    repeats -= 1;
+                    failed.get_or_insert(error);
+                }
+                // It cannot be asked again yet; why is what failed first.
+                Err(resting @ LinkError::Resting { .. }) => return Err(failed.unwrap_or(resting)),
                 other => return other,
             }
         }

@@ -41,7 +41,7 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
     /// Of a thousand answers so many meet one.
-    #[arg(long, value_name = "P", default_value_t = 100, requires = "seed")]
+    #[arg(long, value_name = "P", default_value_t = 100, requires = "seed", value_parser = clap::value_parser!(u32).range(0..=1000))]
     per_mille: u32,
 }
 

@@ -18,7 +18,7 @@ use super::frames::Framing;
 use super::modbus_station::ModbusStation;
 use super::sdo_server::SdoServer;
 use super::serial_station::SerialStation;
-use super::serve::{CYCLE, Shared, WirePort, lock, serve};
+use super::serve::{CYCLE, Ended, Shared, WirePort, lock, serve};
 use super::trouble::{When, WireFaults};
 use crate::bender::Transport;
 
@@ -100,24 +100,31 @@ impl Drop for SimulatedBender {
     }
 }
 
-/// All wires that the door lets in.
+/// All wires that the door lets in. A line and a folder cannot be cut: they are served on.
 async fn serve_door(door: Door, shared: Arc<Shared>) {
     match door {
-        Door::Line(speech, wire, _) => serve_wire(wire, speech, &shared).await,
-        Door::Folder(port, _, profile) => serve(port, FolderStation::new(*profile), &shared).await,
+        Door::Line(speech, mut wire, _) => {
+            while serve_wire(&mut wire, speech, &shared).await == Ended::HungUp {}
+        }
+        Door::Folder(mut port, _, profile) => {
+            let mut station = FolderStation::new(*profile);
+            while serve(&mut port, &mut station, &shared).await == Ended::HungUp {}
+        }
         Door::Bus(mut join, _, profile) => loop {
             match (join(), &profile.transport) {
-                (Ok(port), Transport::Canopen(settings)) => {
-                    serve(port, SdoServer::new(settings.clone()), &shared).await;
+                (Ok(mut port), Transport::Canopen(settings)) => {
+                    serve(&mut port, &mut SdoServer::new(settings.clone()), &shared).await;
                 }
-                (Ok(port), _) => serve(port, CanStation::new(), &shared).await,
+                (Ok(mut port), _) => {
+                    serve(&mut port, &mut CanStation::new(), &shared).await;
+                }
                 (Err(_), _) => {} // away; it may come back
             }
             tokio::time::sleep(REJOIN).await;
         },
         Door::Memory(speech, mut wires) => {
-            while let Some(wire) = wires.recv().await {
-                serve_wire(wire, speech, &shared).await;
+            while let Some(mut wire) = wires.recv().await {
+                serve_wire(&mut wire, speech, &shared).await;
             }
         }
         Door::Socket(framing, listener) => serve_socket(&listener, framing, &shared).await,
@@ -128,7 +135,7 @@ async fn serve_door(door: Door, shared: Arc<Shared>) {
 async fn serve_socket(listener: &TcpListener, framing: Framing, shared: &Arc<Shared>) {
     let mut connections = JoinSet::new();
     loop {
-        let stream = match listener.accept().await {
+        let mut stream = match listener.accept().await {
             Ok((stream, _)) => stream,
             Err(error) => {
                 tracing::error!(%error, "the simulated bender no longer takes connections");
@@ -137,18 +144,26 @@ async fn serve_socket(listener: &TcpListener, framing: Framing, shared: &Arc<Sha
         };
         let _ = stream.set_nodelay(true); // answers would only be slower without
         match framing {
-            Framing::Rtu => serve_wire(stream, Speech::Modbus(framing), shared).await,
+            Framing::Rtu => {
+                serve_wire(&mut stream, Speech::Modbus(framing), shared).await;
+            }
             Framing::Tcp => {
                 let shared = Arc::clone(shared);
-                connections.spawn(async move { serve_wire(stream, Speech::Modbus(framing), &shared).await });
+                connections
+                    .spawn(async move { serve_wire(&mut stream, Speech::Modbus(framing), &shared).await });
             }
         }
     }
 }
 
-async fn serve_wire(wire: impl AsyncRead + AsyncWrite + Unpin + Send, speech: Speech, shared: &Shared) {
+async fn serve_wire(
+    wire: &mut (impl AsyncRead + AsyncWrite + Unpin + Send),
+    speech: Speech,
+    shared: &Shared,
+) -> Ended {
+    let mut port = WirePort(wire);
     match speech {
-        Speech::Modbus(framing) => serve(WirePort(wire), ModbusStation::new(framing), shared).await,
-        Speech::SerialTable(unit) => serve(WirePort(wire), SerialStation::new(unit), shared).await,
+        Speech::Modbus(framing) => serve(&mut port, &mut ModbusStation::new(framing), shared).await,
+        Speech::SerialTable(unit) => serve(&mut port, &mut SerialStation::new(unit), shared).await,
     }
 }

@@ -92,8 +92,17 @@ impl<W: AsyncRead + AsyncWrite + Unpin + Send> Port for WirePort<W> {
     }
 }
 
+/// Why a port is no longer served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ended {
+    /// It was closed.
+    Closed,
+    /// The machine hung up; a port that cannot be cut goes on.
+    HungUp,
+}
+
 /// Until the port is closed or the machine hangs up.
-pub async fn serve<P, S>(mut port: P, mut station: S, shared: &Shared)
+pub async fn serve<P, S>(port: &mut P, station: &mut S, shared: &Shared) -> Ended
 where
     P: MachinePort,
     P::Piece: Damaged,
@@ -110,11 +119,14 @@ where
             Some(Ok(piece)) => {
                 quiet = Duration::ZERO;
                 let (answers, hangs_up) = shared.attend(|controller| station.hear(piece, controller));
-                if hangs_up || shared.answer(&mut port, answers).await.is_err() {
-                    return;
+                if hangs_up {
+                    return Ended::HungUp;
+                }
+                if shared.answer(port, answers).await.is_err() {
+                    return Ended::Closed;
                 }
             }
-            Some(Err(_)) => return,
+            Some(Err(_)) => return Ended::Closed,
             None => {
                 quiet += CYCLE;
                 if quiet > GIVEN_UP {
@@ -123,9 +135,9 @@ where
                 let (pieces, _) = shared.attend(|controller| station.cycle(controller));
                 for piece in pieces {
                     // Other errors pass: the bus may be away for a while.
-                    let sent = shared.damaged(&mut port, piece, false).await;
+                    let sent = shared.damaged(port, piece, false).await;
                     if sent.is_err_and(|error| error.kind() == io::ErrorKind::NotConnected) {
-                        return;
+                        return Ended::Closed;
                     }
                 }
             }
