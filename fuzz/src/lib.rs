@@ -1,5 +1,7 @@
 //! What the targets share: an input read as a script, and the serial table's frames written from its contract, not from the decoder.
 
+pub mod bus;
+
 use benderd::bender::crc_of;
 
 /// An input as a script: its bytes say, one after the other, what happens.
