@@ -121,6 +121,28 @@ async fn tables_arrive_over_a_bus_in_memory() {
     }
 }
 
+#[tokio::test(start_paused = true)]
+async fn machines_on_one_bus_get_their_own_tables() {
+    let meeting = Meeting::Memory(MemoryBus::new());
+    let profiles =
+        [profile(WAYS[2]), profile(("reference-canopen", "node = 5 ", "node = 6 ")), profile(WAYS[0])];
+    let machines = profiles.each_ref().map(|profile| machine(&meeting, profile, None));
+    let [mut a, mut b, mut c] = profiles.each_ref().map(|profile| meeting.link(profile));
+    let [first, second, third] = [100.0, 200.0, 300.0].map(job);
+    let [mut log_a, mut log_b, mut log_c] = [const { Memory(Vec::new()) }; 3];
+    let outcomes = tokio::join!(
+        deliver(&mut a, &first, &mut log_a),
+        deliver(&mut b, &second, &mut log_b),
+        deliver(&mut c, &third, &mut log_c),
+    );
+    assert!(
+        matches!(outcomes, (Outcome::Applied(_), Outcome::Applied(_), Outcome::Applied(_))),
+        "{outcomes:?}"
+    );
+    let lengths = machines.map(|m| m.with(|m| m.active_table()).unwrap().bends[0].length_mm);
+    assert_eq!(lengths, [100.0, 200.0, 300.0]);
+}
+
 #[tokio::test]
 async fn tables_arrive_over_an_interface() {
     let Ok(name) = std::env::var("BENDERD_CAN") else {

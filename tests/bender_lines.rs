@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
 
 use std::path::Path;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use benderd::bender::{
@@ -219,6 +220,12 @@ impl IntentLog for Nothing {
     }
 }
 
+fn job(length_mm: f64) -> Job {
+    let row = CommandRow { length_mm, rotation_rad: 0.0, angle_rad: 1.0 };
+    let table = CommandTable { bends: vec![row], last_length_mm: 50.0 };
+    Job { program: "P1".into(), table, expected_active: None, operation: Operation::New, approved: false }
+}
+
 /// A line and a folder cannot be cut: the machine is heard again, and what became of the commit is found out by reading.
 #[tokio::test]
 async fn a_commit_that_is_not_answered_on_a_line_or_in_a_folder_is_found_out() {
@@ -232,16 +239,7 @@ async fn a_commit_that_is_not_answered_on_a_line_or_in_a_folder_is_found_out() {
         let (mut ends, _kept) = real(&profile, folder.path()).await.unwrap();
         let model = MachineModel::new(profile, "P1", 1);
         let _bender = SimulatedBender::start(ends.door, model, Some(fault), |_| ()).unwrap();
-        let row = CommandRow { length_mm: 100.0, rotation_rad: 0.0, angle_rad: 1.0 };
-        let table = CommandTable { bends: vec![row], last_length_mm: 50.0 };
-        let job = Job {
-            program: "P1".into(),
-            table,
-            expected_active: None,
-            operation: Operation::New,
-            approved: false,
-        };
-        let outcome = deliver(&mut ends.link, &job, &mut Nothing).await;
+        let outcome = deliver(&mut ends.link, &job(100.0), &mut Nothing).await;
         assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
         assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
     }
@@ -254,6 +252,79 @@ async fn a_table_is_delivered_through_a_folder() {
     let (ends, _) = real(&profile, folder.path()).await.unwrap();
     assert_eq!(run(2, 0, &profile, ends).await.unwrap(), Ok(Ending::Applied));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left behind");
+}
+
+/// Two benders with files in one folder: each gets its own table.
+#[tokio::test]
+async fn two_machines_share_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let [one, two] = [1, 2].map(|number| {
+        let mut profile = quick("reference-folder");
+        profile.transport = Transport::Folder(number);
+        profile
+    });
+    let (mut ends, _kept) = real(&one, folder.path()).await.unwrap();
+    let (mut others, _kept) = real(&two, folder.path()).await.unwrap();
+    let start = |door, profile| {
+        SimulatedBender::start(door, MachineModel::new(profile, "P1", 1), None, |_| ()).unwrap()
+    };
+    let benders = [start(ends.door, one), start(others.door, two)];
+    let [first, second] = [job(100.0), job(200.0)];
+    let (mut log, mut other_log) = (Nothing, Nothing);
+    let outcomes = tokio::join!(
+        deliver(&mut ends.link, &first, &mut log),
+        deliver(&mut others.link, &second, &mut other_log)
+    );
+    assert!(matches!(outcomes, (Outcome::Applied(_), Outcome::Applied(_))), "{outcomes:?}");
+    let lengths = benders.map(|b| b.with(|m| m.active_table()).unwrap().bends[0].length_mm);
+    assert_eq!(lengths, [100.0, 200.0]);
+}
+
+/// What was written to the log.
+#[derive(Clone, Default)]
+struct Logged(Arc<Mutex<Vec<u8>>>);
+
+impl std::io::Write for Logged {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.lock().unwrap().extend(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// What a delivery to such a machine leaves in the log.
+async fn logged(level: tracing::Level, fault: Option<Fault>) -> String {
+    let (log, folder) = (Logged::default(), tempfile::tempdir().unwrap());
+    let writer = log.clone();
+    let subscriber = tracing_subscriber::fmt()
+        .with_max_level(level)
+        .with_ansi(false)
+        .with_writer(move || writer.clone())
+        .finish();
+    let profile = quick("reference-rtu");
+    let (mut ends, _kept) = real(&profile, folder.path()).await.unwrap();
+    let model = MachineModel::new(profile, "P1", 1);
+    let _bender = SimulatedBender::start(ends.door, model, fault, |_| ()).unwrap();
+    let _here = tracing::subscriber::set_default(subscriber);
+    let outcome = deliver(&mut ends.link, &job(100.0), &mut Nothing).await;
+    assert_eq!(matches!(outcome, Outcome::Applied(_)), fault.is_none(), "{outcome:?}");
+    let text = log.0.lock().unwrap().clone();
+    String::from_utf8(text).unwrap()
+}
+
+#[tokio::test]
+async fn after_a_delivery_that_failed_its_frames_are_in_the_log() {
+    // Unit 1 reads (03) from 0; the staging area's first registers are written (10) and come back with a bit flipped.
+    let text = logged(tracing::Level::DEBUG, Some(Fault::CorruptStaging)).await;
+    for line in [" s > 01 03 00 00 00", " s < 01 03 ", " s > 01 10 03 E8 00", " s < 01 10 03 E8 00"] {
+        assert!(text.contains(line), "{line} is not in\n{text}");
+    }
+    assert!(text.contains("endpoint="), "{text}");
+    assert!(!logged(tracing::Level::INFO, Some(Fault::CorruptStaging)).await.contains(" s > "));
+    assert!(!logged(tracing::Level::DEBUG, None).await.contains(" s > "), "only after failures");
 }
 
 #[tokio::test]

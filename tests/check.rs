@@ -38,6 +38,7 @@ fn refused(dir: &Path, said: &str) {
 fn one_machine_written_in_two_ways_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     for (one, other) in [
+        ("127.0.0.1:502", "127.0.0.1:502"),
         ("127.0.0.1:502", "127.0.0.1:0502"),
         ("no-such-bender.invalid:502", "No-Such-Bender.INVALID:502"),
         ("127.0.0.1:502", "localhost:502"),
@@ -110,6 +111,57 @@ fn one_serial_port_under_two_names_is_refused() {
     refused(dir.path(), &format!("cell b2 address = {link:?}"));
     write_config(dir.path(), "state", &[(&port, "s1"), (&other, "s2")]);
     assert_eq!(benderd(dir.path(), &["check", "benderd.toml"]), (0, String::new()));
+}
+
+#[test]
+fn a_bus_and_a_folder_are_shared_by_machines_that_take_nothing_of_each_other() {
+    let dir = tempfile::tempdir().unwrap();
+    let profiles = Path::new(env!("CARGO_MANIFEST_DIR")).join("protocols");
+    let other = |name: &str, from: &str, to: &str| {
+        let text = std::fs::read_to_string(profiles.join(name)).unwrap();
+        assert!(text.contains(from), "{name} has no {from}");
+        let file = dir.path().join(format!("other-{name}"));
+        std::fs::write(&file, text.replacen(from, to, 1)).unwrap();
+        file.display().to_string()
+    };
+    let folder = dir.path().join("benders").display().to_string();
+    let second = other("reference-folder.toml", "unit_id = 1 ", "unit_id = 2 ");
+    let node = other("reference-canopen.toml", "node = 5 ", "node = 6 ");
+    // 1440 is 5A0h: what node 32 answers with.
+    let dbc = std::fs::read_to_string(profiles.join("bender.dbc")).unwrap();
+    std::fs::write(dir.path().join("moved.dbc"), dbc.replace("BO_ 800 ", "BO_ 1440 ")).unwrap();
+    let moved = other("reference-can.toml", "dbc = \"bender.dbc\"", "dbc = \"moved.dbc\"");
+    let node_32 = other("reference-canopen.toml", "node = 5 ", "node = 32");
+    let configure = |cells: [(&str, &str); 2]| {
+        write_config(dir.path(), "state", &[(cells[0].0, "s1"), (cells[1].0, "s2")]);
+        let file = dir.path().join("benderd.toml");
+        let mut text = std::fs::read_to_string(&file).unwrap();
+        for (_, profile) in cells {
+            let ours = ["profile = \"reference-rtu\"", "profile = \"reference-modbus\""];
+            let (at, ours) = ours.iter().filter_map(|p| Some((text.find(p)?, p))).min().unwrap();
+            text.replace_range(at..at + ours.len(), &format!("profile={profile:?}"));
+        }
+        std::fs::write(&file, text).unwrap();
+    };
+    for cells in [
+        [(folder.as_str(), "reference-folder"), (&folder, &second)],
+        [("can0", "reference-canopen"), ("can0", &node)],
+        [("can0", "reference-canopen"), ("can0", "reference-can")],
+        [("can0", "reference-can"), ("can1", "reference-can")],
+        [("can0", "reference-can"), ("can0", &node_32)],
+    ] {
+        configure(cells);
+        assert_eq!(benderd(dir.path(), &["check", "benderd.toml"]), (0, String::new()), "{cells:?}");
+    }
+    for cells in [
+        [(folder.as_str(), "reference-folder"), (&folder, "reference-folder")],
+        [("can0", "reference-canopen"), ("can0", "reference-canopen")],
+        [("can0", "reference-can"), ("can0", "reference-can")],
+        [("can0", &moved), ("can0", &node_32)],
+    ] {
+        configure(cells);
+        refused(dir.path(), &format!("cell b2 address = {:?}", cells[1].0));
+    }
 }
 
 #[test]

@@ -1,16 +1,18 @@
 //! Which link leads to a machine, and what is known of it: addresses, line, serial port. Read from a profile's file
 //! (`profile_transport`).
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::can::FrameId;
 use super::can_table::CanSettings;
 use super::direct::DirectMap;
 use super::registers::ModbusMap;
-use super::sdo::CanopenSettings;
+use super::sdo::{CanopenSettings, cob_ids};
 use crate::config::{HOST_PORT, is_device, is_host_port, is_interface};
 
 /// Which link leads to the machine.
@@ -30,6 +32,15 @@ pub enum Transport {
     Can(CanSettings),
     /// Objects of a dictionary on CANopen.
     Canopen(CanopenSettings),
+}
+
+/// What a machine has to itself at an address that others may have, too.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Claim {
+    /// The files of this number.
+    Files(u16),
+    /// Frames of this identifier.
+    Frames(FrameId),
 }
 
 impl Transport {
@@ -54,6 +65,22 @@ impl Transport {
             Transport::Can(_) | Transport::Canopen(_) => {
                 "the name of a CAN interface, \"can0\": a letter, then up to 14 letters and digits"
             }
+        }
+    }
+
+    /// What of its address belongs to this machine, so that another that takes none of it can have the same address: a number in a folder,
+    /// identifiers on a bus. None: all of it.
+    pub fn claims(&self) -> Option<BTreeSet<Claim>> {
+        let ids = |ids: &[FrameId]| Some(ids.iter().copied().map(Claim::Frames).collect());
+        match self {
+            Transport::Folder(number) => Some(BTreeSet::from([Claim::Files(*number)])),
+            Transport::Can(settings) => ids(&settings.contract.ids()),
+            Transport::Canopen(settings) => {
+                let (request, response) = cob_ids(settings.node);
+                ids(&[request, response])
+            }
+            // One at a time is asked on a line, and a gateway's unit numbers are no proof that there are two machines.
+            _ => None,
         }
     }
 

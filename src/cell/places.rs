@@ -9,12 +9,14 @@ use std::net::ToSocketAddrs;
 use std::path::{Component, Path, PathBuf};
 
 use super::setup::SetupError;
-use crate::config::{CellConfig, DaemonConfig, is_device};
+use crate::bender::Transport;
+use crate::config::{CellConfig, DaemonConfig, is_device, is_interface};
 
-/// Refuses cells in each other's way, and folders that cannot be used by whoever asks.
-pub fn check(config: &DaemonConfig) -> Result<(), SetupError> {
-    for (i, cell) in config.cells.iter().enumerate() {
-        config.cells[..i].iter().try_for_each(|other| refuse_sharing(cell, other))?;
+/// Refuses cells in each other's way, and folders that cannot be used by whoever asks. `machines` are the cells' own, in their order.
+pub fn check(config: &DaemonConfig, machines: &[&Transport]) -> Result<(), SetupError> {
+    let cells: Vec<_> = config.cells.iter().zip(machines.iter().copied()).collect();
+    for (i, (cell, machine)) in cells.iter().enumerate() {
+        cells[..i].iter().try_for_each(|other| refuse_sharing((cell, machine), *other))?;
         refuse_journal_among_scans(cell, &config.state_dir)?;
     }
     usable("state_dir", &config.state_dir)?;
@@ -28,13 +30,17 @@ pub fn check(config: &DaemonConfig) -> Result<(), SetupError> {
     Ok(())
 }
 
-fn refuse_sharing(cell: &CellConfig, other: &CellConfig) -> Result<(), SetupError> {
+fn refuse_sharing(
+    (cell, machine): (&CellConfig, &Transport),
+    (other, their_machine): (&CellConfig, &Transport),
+) -> Result<(), SetupError> {
     let refuse = |key, found: String, theirs: String| {
         let clash = format!("cell {} has {theirs}", other.name);
         Err(SetupError::Shared { cell: cell.name.clone(), key, found, clash })
     };
-    if !machines(&cell.address).is_disjoint(&machines(&other.address)) {
-        let theirs = format!("the same machine as {:?}", other.address);
+    if !machines(&cell.address).is_disjoint(&machines(&other.address)) && clash(machine, their_machine) {
+        let by = if machine.claims().is_some() { ", by its number, node or identifiers" } else { "" };
+        let theirs = format!("the same machine as {:?}{by}", other.address);
         return refuse("address", format!("{:?}", cell.address), theirs);
     }
     let (ours, theirs) = (real_path(&cell.scan_folder), real_path(&other.scan_folder));
@@ -42,6 +48,14 @@ fn refuse_sharing(cell: &CellConfig, other: &CellConfig) -> Result<(), SetupErro
         return refuse("scan.folder", ours.display().to_string(), theirs.display().to_string());
     }
     Ok(())
+}
+
+/// Whether two at one address may be one machine, or hear each other's answers.
+fn clash(one: &Transport, other: &Transport) -> bool {
+    match (one.claims(), other.claims()) {
+        (Some(ours), Some(theirs)) => !ours.is_disjoint(&theirs),
+        _ => true,
+    }
 }
 
 /// The journal would be taken for a scan and moved away. Scan folders within the state folder are usual: the
@@ -59,11 +73,14 @@ fn refuse_journal_among_scans(cell: &CellConfig, state_dir: &Path) -> Result<(),
     })
 }
 
-/// Every machine that an address may mean (a serial port, whatever links lead to it), and the address itself: a name may be unknown while the network is
-/// down.
+/// Every place that an address may mean (a serial port or folder, whatever links lead to it), and the address itself: a name may be
+/// unknown while the network is down.
 fn machines(address: &str) -> BTreeSet<String> {
     if is_device(address) {
         return BTreeSet::from([real_path(Path::new(address)).display().to_string()]);
+    }
+    if is_interface(address) {
+        return BTreeSet::from([address.to_owned()]);
     }
     let mut all = BTreeSet::new();
     if let Some((host, port)) = address.rsplit_once(':') {

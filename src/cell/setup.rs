@@ -95,7 +95,8 @@ impl Setup {
         let materials = Materials::load(config.materials.as_deref())?;
         let setups =
             config.cells.iter().map(|c| Setup::load(c, &materials)).collect::<Result<Vec<_>, _>>()?;
-        places::check(config)?;
+        let machines: Vec<_> = setups.iter().map(|setup| &setup.profile.transport).collect();
+        places::check(config, &machines)?;
         Ok(setups)
     }
 

@@ -181,7 +181,7 @@ fn profile(text: &str, base: &Path) -> String {
     if is_file { base.join(text).display().to_string() } else { text.to_owned() }
 }
 
-/// Two cells on one machine would undo each other's tables; on one folder they would take each other's scans.
+/// Two cells on one folder would take each other's scans. Whether they are at one machine their profiles say: `cell` looks.
 fn refuse_sharing(
     doc: &Document,
     raw: &RawCell,
@@ -193,10 +193,6 @@ fn refuse_sharing(
         let key = |what: &str| format!("cell {} {what}", cell.name);
         if cell.name == other.name {
             return Err(doc.value_error(raw.name.span(), "cell.name", &cell.name, theirs("name")));
-        }
-        if cell.address == other.address {
-            let span = raw.address.span();
-            return Err(doc.value_error(span, &key("address"), &cell.address, theirs("machine")));
         }
         if cell.scan_folder == other.scan_folder {
             let span = raw.scan.folder.span();
@@ -254,12 +250,10 @@ mod tests {
     }
 
     #[test]
-    fn cells_share_neither_name_nor_machine_nor_folder() {
+    fn cells_share_neither_name_nor_folder() {
         let other = CELL.replace("b1", "b2").replace("0.5", "0.6").replace("scans", "scans2");
         assert_eq!(parse(&file(&format!("{CELL}{other}"))).unwrap().cells.len(), 2);
-        for (own, taken, key) in
-            [("b2", "b1", "cell.name"), ("0.6", "0.5", "b2 address"), ("scans2", "scans", "b2 scan.folder")]
-        {
+        for (own, taken, key) in [("b2", "b1", "cell.name"), ("scans2", "scans", "b2 scan.folder")] {
             let error = parse(&file(&format!("{CELL}{}", other.replace(own, taken)))).unwrap_err();
             assert!(error.contains(key) && error.contains("cell b1 has this one"), "{error}");
         }

@@ -2,6 +2,7 @@
 //!
 //! Made when a profile is loaded; the exchanges pack and unpack by it.
 
+use crate::bender::can::FrameId;
 use crate::bender::dbc::{Database, DbcError, Message, Presence};
 use crate::bender::profile::TableFormat;
 
@@ -93,6 +94,15 @@ impl Contract {
                 None
             },
         })
+    }
+}
+
+impl Contract {
+    /// The identifiers of all its frames.
+    pub fn ids(&self) -> Vec<FrameId> {
+        let pairs = [Some(&self.item), Some(&self.commit), self.row.as_ref()];
+        let pairs = pairs.into_iter().flatten().flat_map(|(asked, echo)| [asked, echo]);
+        [&self.state, &self.status].into_iter().chain(pairs).map(|message| message.id).collect()
     }
 }
 
