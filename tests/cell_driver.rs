@@ -226,6 +226,21 @@ async fn a_silent_machine_faults_the_cell() {
     assert!(state.to_string().contains("no answer within"), "{state}");
 }
 
+/// Each answer takes 300 ms: the cell is disarmed long before the commit.
+#[tokio::test]
+async fn a_delivery_that_is_disarmed_on_its_way_is_not_committed() {
+    let mut cell = cell(Mode::Automatic, Some(Fault::Late { ms: 300 }), &[Verdict::FirstPiece]).await;
+    cell.arm().await;
+    cell.until(|s| matches!(s, State::Delivering(_))).await;
+    cell.commands.send(Command::Disarm).await.unwrap();
+    cell.until(|s| *s == State::Disarmed).await;
+    assert_eq!(cell.revision(), 0);
+    let records = cell.stop().await;
+    assert!(!kinds(&records).contains(&"intent"), "{:?}", kinds(&records));
+    let outcome = records.iter().find(|r| r.kind == "outcome").unwrap();
+    assert!(outcome.content.contains("disarmed") && outcome.content.contains("not_applied"), "{outcome:?}");
+}
+
 #[tokio::test]
 async fn a_commit_whose_answer_is_lost_is_found_to_be_applied_and_sent_once() {
     let mut cell = cell(Mode::Automatic, Some(Fault::DropAfterApply), &[Verdict::FirstPiece]).await;

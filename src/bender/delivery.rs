@@ -171,9 +171,15 @@ pub struct Delivery {
     first: Option<(Status, u64)>,
     id: TableId,
     image: Vec<u8>,
+    /// When the machine's state was read last before the commit, and what it had said to an earlier one by then.
+    rechecked: (u64, u32, Ack),
     committed_ms: u64,
-    /// The machine confirmed the commit's arrival: a refusal seen from then on is about this commit.
+    /// The machine confirmed the commit's arrival: a refusal seen from then on may be about this commit.
     answered: bool,
+    /// The machine was seen with this commit before it: its next refusal is about it.
+    taken: bool,
+    /// Why the commit was not confirmed.
+    doubt: Option<String>,
     /// Since when the old table is in force with no commit pending.
     quiet_since_ms: Option<u64>,
     outcome: Option<Outcome>,
@@ -260,8 +266,11 @@ impl Delivery {
             first: None,
             id: TableId::default(),
             image: Vec::new(),
+            rechecked: (0, 0, Ack::None),
             committed_ms: 0,
             answered: false,
+            taken: false,
+            doubt: None,
             quiet_since_ms: None,
             outcome: None,
         };
@@ -293,7 +302,10 @@ impl Delivery {
                 self.answered = true;
                 self.go(State::Confirming, Action::ReadActive)
             }
-            (State::Committing, _) => self.go(State::Confirming, Action::ReadActive),
+            (State::Committing, event) => {
+                self.doubt = Some(describe(event));
+                self.go(State::Confirming, Action::ReadActive)
+            }
             (State::Confirming, Event::ActiveRead(active)) => self.judge(&active, now_ms),
             (State::Confirming, event) => {
                 self.quiet_since_ms = None;
@@ -323,7 +335,9 @@ impl Delivery {
         let Some(job) = &self.job else { return self.finished() };
         let direct = self.profile.transport.direct().is_some();
         let wrong = if direct { Vec::new() } else { identity(job, &status) };
-        if wrong.is_empty() && status.active.revision != 0 && status.active.crc == job.crc {
+        let nothing_to_come = status.pending.revision == 0; // else it would replace the table that is active
+        if wrong.is_empty() && nothing_to_come && status.active.revision != 0 && status.active.crc == job.crc
+        {
             return self.finish(Outcome::AlreadyActive(status.active));
         }
         let reasons = gate(&self.profile, job, &status);
@@ -384,6 +398,7 @@ impl Delivery {
         if !reasons.is_empty() {
             return self.finish(Outcome::Rejected { reasons });
         }
+        self.rechecked = (now_ms, status.ack_revision, status.ack);
         let intent = Intent {
             bender: self.profile.name.clone(),
             program: job.job.program.clone(),
@@ -394,8 +409,17 @@ impl Delivery {
         self.go(State::Journalling, Action::JournalIntent(intent))
     }
 
-    /// Step 4: the one commit.
+    /// Step 4: the one commit, if what it rests on was seen a moment ago: a disk can be slow.
     fn commit(&mut self, now_ms: u64) -> Action {
+        let (age_ms, allowed_ms) =
+            (now_ms.saturating_sub(self.rechecked.0), self.profile.deadlines.heartbeat_ms);
+        if age_ms > allowed_ms {
+            let why = format!(
+                "the journal took {age_ms} ms, and the machine's state may be trusted for {allowed_ms} ms (heartbeat_ms) only; \
+                 nothing was committed: look at the disk that the journal is on, then deliver again"
+            );
+            return self.finish(Outcome::NotApplied { why });
+        }
         self.committed_ms = now_ms;
         self.go(State::Committing, Action::Commit(self.id))
     }
@@ -417,11 +441,15 @@ impl Delivery {
             return self.look_again(now_ms, why);
         }
         if status.pending.revision != 0 {
+            self.taken |= status.pending == self.id;
             self.quiet_since_ms = None;
             return self.look_again(now_ms, "the machine has not dealt with the commit yet".into());
         }
+        // The same as before the commit may be the answer to an earlier one of the same revision.
+        let is_new = self.taken || (status.ack_revision, status.ack) != (self.rechecked.1, self.rechecked.2);
         if let Ack::Refused(code) = status.ack
             && self.answered
+            && is_new
             && status.ack_revision == self.id.revision
         {
             let text = format!("the machine refused {}: {} (code {code})", self.id, Ack::meaning(code));
@@ -429,17 +457,35 @@ impl Delivery {
         }
         let since = *self.quiet_since_ms.get_or_insert(now_ms);
         if now_ms.saturating_sub(since) >= self.profile.deadlines.settle_ms {
-            let why = format!("the commit did not take effect: the active table is still {}", status.active);
+            let said = self.said(status);
+            let why =
+                format!("the commit did not take effect: the active table is still {}{said}", status.active);
             return self.finish(Outcome::NotApplied { why });
         }
         self.look_again(now_ms, format!("the active table is still {}", status.active))
     }
 
+    /// What else is known of a commit that did nothing.
+    fn said(&self, status: &Status) -> String {
+        let mut out = String::new();
+        if let Some(doubt) = &self.doubt {
+            out += &format!("; when it was sent: {doubt}");
+        }
+        if let Ack::Refused(code) = status.ack
+            && status.ack_revision == self.id.revision
+        {
+            out += &format!("; the machine's last word is a refusal: {} (code {code})", Ack::meaning(code));
+        }
+        out
+    }
+
     fn look_again(&mut self, now_ms: u64, why: String) -> Action {
         let Deadlines { confirm_ms, poll_ms, .. } = self.profile.deadlines;
         if now_ms.saturating_sub(self.committed_ms) >= confirm_ms {
+            let doubt =
+                self.doubt.as_ref().map_or(String::new(), |doubt| format!("; when it was sent: {doubt}"));
             let why = format!(
-                "{} was committed, and {confirm_ms} ms later it is not known whether it is active: {why}",
+                "{} was committed, and {confirm_ms} ms later it is not known whether it is active: {why}{doubt}",
                 self.id
             );
             return self.finish(Outcome::Unknown { why });

@@ -261,3 +261,73 @@ fn the_last_revision_is_not_wrapped() {
     };
     assert_eq!(reasons[0].code, "revision");
 }
+
+/// As the reference machine has it after a refused attempt: the next one carries the same revision.
+fn refused_before() -> Delivery {
+    let before = |heartbeat| Status { ack: Ack::Refused(4), ..status(heartbeat) };
+    let (mut delivery, _) = Delivery::start(&profile(), &job());
+    for event in [
+        Event::StatusRead(before(1)),
+        Event::Written,
+        Event::ReadBack(image()),
+        Event::StatusRead(before(2)),
+        Event::IntentJournalled,
+        Event::Committed,
+    ] {
+        delivery.on(event, 100);
+    }
+    delivery
+}
+
+#[test]
+fn a_refusal_that_stood_there_before_the_commit_is_not_its_answer() {
+    let refused = || active(|s| s.ack = Ack::Refused(4), vec![]);
+    let payload = prepare(&profile(), &job()).unwrap().payload;
+    let mut d = refused_before();
+    assert!(matches!(d.on(refused(), 120), Action::Wait { .. }));
+    d.on(Event::Timeout, 140);
+    assert_eq!(d.on(active(|s| s.active = new(), payload), 140), Action::Finish(Outcome::Applied(new())));
+    // Once the machine was seen with this commit, the same words are about it.
+    let mut d = refused_before();
+    d.on(active(|s| (s.ack, s.pending) = (Ack::Refused(4), new()), vec![]), 120);
+    d.on(Event::Timeout, 140);
+    let Action::Finish(Outcome::Rejected { reasons }) = d.on(refused(), 140) else { panic!() };
+    assert_eq!(reasons[0].code, "machine");
+    // Never seen with it: nothing can come any more once it is quiet.
+    let mut d = refused_before();
+    d.on(refused(), 120);
+    d.on(Event::Timeout, 620);
+    let Action::Finish(Outcome::NotApplied { why }) = d.on(refused(), 620) else { panic!() };
+    assert!(why.contains("the machine's last word is a refusal") && why.contains("(code 4)"), "{why}");
+}
+
+#[test]
+fn what_was_seen_too_long_before_the_commit_is_not_relied_on() {
+    let journalling = || deliveries().into_iter().find(|(name, _)| *name == "journalling").unwrap().1;
+    // heartbeat_ms is 1000, the machine was seen at 100.
+    assert_eq!(journalling().on(Event::IntentJournalled, 1100), Action::Commit(new()));
+    let Action::Finish(Outcome::NotApplied { why }) = journalling().on(Event::IntentJournalled, 1101) else {
+        panic!()
+    };
+    assert!(why.contains("the journal took 1001 ms") && why.contains("nothing was committed"), "{why}");
+}
+
+#[test]
+fn the_jobs_own_table_is_not_taken_for_delivered_while_another_may_replace_it() {
+    let (mut delivery, _) = Delivery::start(&profile(), &job());
+    let status = with(|s| (s.active, s.pending) = (new(), OLD));
+    let Action::Finish(Outcome::Rejected { reasons }) = delivery.on(Event::StatusRead(status), 0) else {
+        panic!()
+    };
+    assert_eq!(reasons[0].code, "commit_pending");
+}
+
+#[test]
+fn why_the_commit_was_not_confirmed_is_told() {
+    let mut d = deliveries().into_iter().find(|(name, _)| *name == "committing").unwrap().1;
+    d.on(Event::Failed("the machine was busy".into()), 150);
+    d.on(active(|_| (), vec![]), 200);
+    d.on(Event::Timeout, 700);
+    let Action::Finish(Outcome::NotApplied { why }) = d.on(active(|_| (), vec![]), 700) else { panic!() };
+    assert!(why.ends_with("; when it was sent: the machine was busy"), "{why}");
+}

@@ -14,6 +14,11 @@ pub trait IntentLog: Send {
     /// Before the commit.
     fn intent(&mut self, intent: &Intent) -> Result<(), LogError>;
 
+    /// Whether the commit is still wanted: asked right before it, since staging takes time. Else why not.
+    fn still_wanted(&self) -> Result<(), String> {
+        Ok(())
+    }
+
     /// After it, or in its stead; `intent` is the one journalled in this delivery, if it came that far.
     fn outcome(&mut self, job: &Job, intent: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError>;
 }
@@ -29,13 +34,13 @@ pub async fn deliver<B: Bender>(bender: &mut B, job: &Job, log: &mut dyn IntentL
             Action::ReadStatus => answer(bender.read_status().await, Event::StatusRead),
             Action::WriteStaging(staged) => answer(bender.write_staging(&staged).await, |()| Event::Written),
             Action::ReadStaging { bytes } => answer(bender.read_staging(bytes).await, Event::ReadBack),
-            Action::JournalIntent(intent) => match log.intent(&intent) {
+            Action::JournalIntent(intent) => match journal(log, &intent) {
                 Ok(()) => {
                     tracing::info!(program = intent.program, new = %intent.new, old = %intent.old, "committing");
                     journalled = Some(intent);
                     Event::IntentJournalled
                 }
-                Err(error) => Event::Failed(format!("the intent could not be journalled: {error}")),
+                Err(why) => Event::Failed(why),
             },
             Action::Commit(id) => answer(bender.commit(id).await, |()| Event::Committed),
             Action::ReadActive => answer(bender.read_active().await, Event::ActiveRead),
@@ -54,6 +59,13 @@ pub async fn deliver<B: Bender>(bender: &mut B, job: &Job, log: &mut dyn IntentL
         let now_ms = u64::try_from(start.elapsed().as_millis()).unwrap_or(u64::MAX);
         action = delivery.on(event, now_ms);
     }
+}
+
+/// The intent on disk, and the commit wanted before and after that: a disk can be slow.
+fn journal(log: &mut dyn IntentLog, intent: &Intent) -> Result<(), String> {
+    log.still_wanted()?;
+    log.intent(intent).map_err(|error| format!("the intent could not be journalled: {error}"))?;
+    log.still_wanted()
 }
 
 /// What went over the link before a delivery that did not do what was wanted.

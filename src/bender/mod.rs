@@ -72,6 +72,7 @@ mod selftest_endpoint;
 mod selftest_judge;
 mod serial_frame;
 mod serial_table;
+mod socket;
 mod status_image;
 mod table_link;
 mod transport;

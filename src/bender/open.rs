@@ -4,7 +4,6 @@
 
 use std::io;
 
-use tokio::net::TcpStream;
 use tokio_modbus::Slave;
 use tokio_modbus::client::{Context, tcp};
 use tokio_serial::{DataBits, SerialPortBuilderExt as _, SerialStream, StopBits};
@@ -13,6 +12,7 @@ use super::line::{Line, Wire};
 use super::profile::Profile;
 use super::recording::{Frames, Recorded};
 use super::rs485;
+use super::socket::Socket;
 use super::transport::{Parity, SerialSettings};
 
 /// What leads to the machine, open.
@@ -51,16 +51,9 @@ pub async fn wire(
     let wire: Box<dyn Wire> = match (opener, profile.transport.serial()) {
         (Some(opener), _) => opener()?,
         (None, Some(settings)) => Box::new(serial_port(endpoint, settings)?),
-        (None, None) => Box::new(socket(endpoint).await?),
+        (None, None) => Box::new(Socket::connect(endpoint).await?),
     };
     Ok(Box::new(Recorded::new(wire, frames.clone())))
-}
-
-async fn socket(endpoint: &str) -> io::Result<TcpStream> {
-    let stream = TcpStream::connect(endpoint).await?;
-    // Small requests wait for each other otherwise; a socket that cannot do this still works.
-    let _ = stream.set_nodelay(true);
-    Ok(stream)
 }
 
 /// Opens a serial port for this process alone.

@@ -5,6 +5,7 @@
 //! with events, so the cell can be disarmed at any time.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use serde_json::json;
@@ -91,6 +92,8 @@ pub struct Driver<S, C> {
     journal: Journal,
     notices: broadcast::Sender<Notice>,
     asks: mpsc::Sender<Ask>,
+    /// Ticket of the delivery that may be committed, as the machine's task sees it; 0: of none.
+    wanted: Arc<AtomicU64>,
     /// For work that is handed out; its events come back through `results`.
     events: mpsc::Sender<Event>,
     results: mpsc::Receiver<Event>,
@@ -112,7 +115,8 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
         let [journal, for_worker] = journals;
         let (asks, asked) = mpsc::channel(QUEUE);
         let (events, results) = mpsc::channel(QUEUE);
-        let worker = Worker::new(bender, &identity.name, for_worker)?;
+        let wanted = Arc::new(AtomicU64::new(0));
+        let worker = Worker::new(bender, &identity.name, for_worker, Arc::clone(&wanted))?;
         tokio::spawn(worker.run(asked, events.clone()));
         Ok(Driver {
             cell: Cell::new(identity.mode, &identity.program, identity.dwell),
@@ -122,6 +126,7 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
             journal,
             notices: broadcast::channel(NOTICES).0,
             asks,
+            wanted,
             events,
             results,
             started: Instant::now(),
@@ -169,6 +174,8 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
         self.put_on_record(&event);
         let before = self.cell.state().clone();
         let actions = self.cell.on(self.started.elapsed(), event);
+        // Before anything else: what is disarmed must not be committed any more.
+        self.wanted.store(self.cell.wants_commit().map_or(0, |ticket| ticket.0), Ordering::SeqCst);
         for action in actions {
             if let Err(error) = self.perform(action).await {
                 self.filing_error = Some(format!("scans cannot be filed away: {error}"));

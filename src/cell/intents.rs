@@ -27,9 +27,13 @@ impl<'a> JournalledIntents<'a> {
     }
 
     /// Decides an earlier commit whose outcome is open (it was unknown, or the program died before writing it
-    /// down) by the table that the machine holds now, and records that. None when nothing is open.
-    pub fn resolve(&mut self, active: TableId) -> Result<Option<Outcome>, JournalError> {
+    /// down) by the table that the machine holds now, and records that. None when nothing is open, or while the machine has not dealt
+    /// with it.
+    pub fn resolve(&mut self, active: TableId, pending: TableId) -> Result<Option<Outcome>, JournalError> {
         let Some((new, old)) = self.open_intent()? else { return Ok(None) };
+        if pending == new {
+            return Ok(None);
+        }
         let outcome = if active == new {
             Outcome::Applied(new)
         } else if active == old {
@@ -127,6 +131,7 @@ mod tests {
 
     const OLD: TableId = TableId { revision: 7, crc: 1 };
     const NEW: TableId = TableId { revision: 8, crc: 2 };
+    const NONE: TableId = TableId { revision: 0, crc: 0 };
 
     fn intent() -> Intent {
         Intent {
@@ -160,13 +165,22 @@ mod tests {
             [(NEW, "applied"), (OLD, "not_applied"), (TableId { revision: 9, crc: 3 }, "unknown")]
         {
             with_log(|log| {
-                assert_eq!(log.resolve(found).unwrap(), None, "nothing is open at first");
+                assert_eq!(log.resolve(found, NONE).unwrap(), None, "nothing is open at first");
                 log.intent(&intent()).unwrap();
-                let outcome = serde_json::to_value(log.resolve(found).unwrap()).unwrap();
+                let outcome = serde_json::to_value(log.resolve(found, NONE).unwrap()).unwrap();
                 assert_eq!(outcome["outcome"], expected);
-                assert_eq!(log.resolve(found).unwrap(), None, "decided once");
+                assert_eq!(log.resolve(found, NONE).unwrap(), None, "decided once");
             });
         }
+    }
+
+    #[test]
+    fn a_commit_that_the_machine_has_not_dealt_with_stays_open() {
+        with_log(|log| {
+            log.intent(&intent()).unwrap();
+            assert_eq!(log.resolve(OLD, NEW).unwrap(), None);
+            assert_eq!(log.resolve(NEW, NONE).unwrap(), Some(Outcome::Applied(NEW)), "not before");
+        });
     }
 
     #[test]
@@ -174,10 +188,10 @@ mod tests {
         with_log(|log| {
             log.intent(&intent()).unwrap();
             log.outcome(&job(), Some(&intent()), &Outcome::Applied(NEW)).unwrap();
-            assert_eq!(log.resolve(OLD).unwrap(), None);
+            assert_eq!(log.resolve(OLD, NONE).unwrap(), None);
             log.intent(&intent()).unwrap();
             log.outcome(&job(), Some(&intent()), &Outcome::Unknown { why: "w".into() }).unwrap();
-            assert_eq!(log.resolve(NEW).unwrap(), Some(Outcome::Applied(NEW)));
+            assert_eq!(log.resolve(NEW, NONE).unwrap(), Some(Outcome::Applied(NEW)));
         });
     }
 
@@ -198,7 +212,7 @@ mod tests {
             log.outcome(&job(), Some(&of(2.0)), &Outcome::NotApplied { why: "w".into() }).unwrap();
             assert_eq!(found(log), 1.0);
             log.intent(&of(3.0)).unwrap();
-            log.resolve(NEW).unwrap();
+            log.resolve(NEW, NONE).unwrap();
             assert_eq!(found(log), 3.0);
             assert_eq!(log.last_applied("P2").unwrap(), None, "another program's");
         });
@@ -209,6 +223,6 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut journal = Journal::open(&dir.path().join("j.db")).unwrap();
         JournalledIntents::new(&mut journal, "m:1").intent(&intent()).unwrap();
-        assert_eq!(JournalledIntents::new(&mut journal, "m:2").resolve(NEW).unwrap(), None);
+        assert_eq!(JournalledIntents::new(&mut journal, "m:2").resolve(NEW, NONE).unwrap(), None);
     }
 }

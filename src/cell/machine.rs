@@ -162,6 +162,11 @@ impl Cell {
         self.ticket == ticket
     }
 
+    /// The delivery that may still be committed; none once it was disarmed or given up.
+    pub fn wants_commit(&self) -> Option<Ticket> {
+        (matches!(self.state, State::Delivering(_)) && !self.disarm_after).then_some(self.ticket)
+    }
+
     /// When a [`Event::Tick`] is due: the end of the state's longest dwell, or the next attempt after a fault.
     pub fn wake_at(&self) -> Option<Duration> {
         let dwell = match &self.state {
@@ -232,7 +237,7 @@ impl Cell {
         self.read(if self.mode == Mode::Observe { Purpose::Contact } else { Purpose::Arming })
     }
 
-    /// A delivery under way cannot be taken back: its end is waited for, then the cell is disarmed.
+    /// A delivery under way is not committed any more, if it is not yet; its end is waited for, then the cell is disarmed.
     fn disarm(&mut self) -> Vec<Action> {
         let then = match &self.state {
             State::Faulted(fault) => Some(&fault.then),

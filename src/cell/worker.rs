@@ -4,6 +4,9 @@
 //! give up waiting, while the machine is slow. It also settles deliveries that were cut short: an intent in the
 //! journal without a definite outcome is closed by what the machine holds at the next contact.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use serde_json::json;
 use tokio::sync::mpsc;
 
@@ -32,6 +35,8 @@ pub struct Worker<B> {
     /// The cell's name, under which the journal knows this machine.
     name: String,
     journal: Journal,
+    /// Ticket of the delivery that the cell still wants to be committed; 0: of none.
+    wanted: Arc<AtomicU64>,
     /// A commit that may have gone out and whose end nobody has seen.
     open: Option<TableId>,
 }
@@ -40,6 +45,8 @@ pub struct Worker<B> {
 struct Committing<'a> {
     log: JournalledIntents<'a>,
     id: Option<TableId>,
+    ticket: Ticket,
+    wanted: &'a AtomicU64,
 }
 
 impl IntentLog for Committing<'_> {
@@ -49,6 +56,14 @@ impl IntentLog for Committing<'_> {
         Ok(())
     }
 
+    fn still_wanted(&self) -> Result<(), String> {
+        if self.wanted.load(Ordering::SeqCst) == self.ticket.0 {
+            return Ok(());
+        }
+        Err("the cell was disarmed, or had waited for too long, before the commit: nothing was committed"
+            .to_owned())
+    }
+
     fn outcome(&mut self, job: &Job, intent: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError> {
         self.log.outcome(job, intent, outcome)
     }
@@ -56,9 +71,14 @@ impl IntentLog for Committing<'_> {
 
 impl<B: Bender> Worker<B> {
     /// Looks into the journal for a delivery of an earlier run that has no end.
-    pub fn new(bender: B, name: &str, journal: Journal) -> Result<Worker<B>, JournalError> {
+    pub fn new(
+        bender: B,
+        name: &str,
+        journal: Journal,
+        wanted: Arc<AtomicU64>,
+    ) -> Result<Worker<B>, JournalError> {
         let open = open_intent(&journal, name)?;
-        Ok(Worker { bender, name: name.to_owned(), journal, open })
+        Ok(Worker { bender, name: name.to_owned(), journal, wanted, open })
     }
 
     /// Answers until nobody asks any more.
@@ -66,7 +86,7 @@ impl<B: Bender> Worker<B> {
         while let Some(ask) = asks.recv().await {
             let event = match ask {
                 Ask::Read(ticket) => self.read(ticket).await,
-                Ask::Deliver(ticket, job) => Event::Delivered(ticket, self.deliver(&job).await),
+                Ask::Deliver(ticket, job) => Event::Delivered(ticket, self.deliver(ticket, &job).await),
                 Ask::Reset => {
                     self.bender.reset();
                     continue;
@@ -93,13 +113,13 @@ impl<B: Bender> Worker<B> {
                 }
             },
         };
-        self.settle(id);
+        self.settle(id, active.status.pending);
         Event::MachineRead(ticket, InForce { id, program: active.status.program, table })
     }
 
-    /// The machine's word on a delivery that was cut short.
-    fn settle(&mut self, found: TableId) {
-        let Some(intended) = self.open.take() else { return };
+    /// The machine's word on a delivery that was cut short, once it has dealt with it.
+    fn settle(&mut self, found: TableId, pending: TableId) {
+        let Some(intended) = self.open.take_if(|intended| *intended != pending) else { return };
         let applied = found == intended;
         tracing::warn!(cell = self.name, %intended, %found, applied, "an unfinished delivery is resolved");
         let content =
@@ -107,9 +127,9 @@ impl<B: Bender> Worker<B> {
         record(&mut self.journal, "resolution", &content);
     }
 
-    async fn deliver(&mut self, job: &Job) -> Delivered {
+    async fn deliver(&mut self, ticket: Ticket, job: &Job) -> Delivered {
         let log = JournalledIntents::new(&mut self.journal, self.name.as_str());
-        let mut log = Committing { log, id: None };
+        let mut log = Committing { log, id: None, ticket, wanted: &self.wanted };
         let outcome = deliver(&mut self.bender, job, &mut log).await;
         let committed = log.id;
         match outcome {

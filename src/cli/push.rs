@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Outcome as Exit, push_text, say};
 use crate::bender::{
-    ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Operation, Outcome, Profile, Reason,
+    ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Operation, Outcome, Profile, Reason, Status,
     TableId, check_program, deliver, gate, objections, prepare,
 };
 use crate::cell::JournalledIntents;
@@ -229,7 +229,8 @@ fn rehearse(profile: &Profile, job: &Job, active: &ActiveTable) -> Result<Option
     if let Operation::Correct { last } = &job.operation {
         reasons.extend(objections(profile, &job.program, last, &job.table, active));
     }
-    if active.status.active.revision != 0 && active.status.active.crc == prepared.crc {
+    let Status { active: in_force, pending, .. } = &active.status;
+    if in_force.revision != 0 && in_force.crc == prepared.crc && pending.revision == 0 {
         return Ok(Some(Outcome::AlreadyActive(active.status.active)));
     }
     if reasons.is_empty() { Ok(None) } else { Err(Outcome::Rejected { reasons }) }
@@ -237,7 +238,7 @@ fn rehearse(profile: &Profile, job: &Job, active: &ActiveTable) -> Result<Option
 
 /// An earlier commit whose outcome stayed open is decided by what the machine holds now.
 fn resolve(log: &mut JournalledIntents, active: &ActiveTable) -> Option<Outcome> {
-    match log.resolve(active.status.active) {
+    match log.resolve(active.status.active, active.status.pending) {
         Ok(resolved) => resolved,
         Err(error) => {
             let _ = writeln!(std::io::stderr(), "warning: an open delivery could not be looked up: {error}");
