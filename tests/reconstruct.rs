@@ -248,6 +248,19 @@ fn ends_and_passes_that_once_misled() {
     expect_right(Set::Hard, &[89191, 90161, 91026, 91216]);
 }
 
+/// Oblique ends, 8 to 15 degrees, whose outlines left that open and were thought to be square or nearly so.
+#[test]
+fn oblique_ends_that_once_were_silently_wrong() {
+    expect_right(Set::Hard, &[91246, 92078, 92196]);
+}
+
+/// A section of face and bore at an end drew the first fit off its way: an arc swallowed the end straight, whose points then passed
+/// for strangers'.
+#[test]
+fn an_end_that_once_drew_the_tube_off_its_way() {
+    expect_right(Set::Hard, &[93023]);
+}
+
 /// Flat walls that had bends of their own and so were never seen (91052, 91099), a search that began again and found less than the one
 /// before (89050, 91054), one that lost what only beginning again finds (91023), and one that ran to and fro (89035).
 #[test]

@@ -7,9 +7,8 @@ use nalgebra::Point3;
 
 use super::face::{self, Face, Search};
 use super::outline::{self, Outline};
+use super::square::MOST_OBLIQUE;
 
-/// No saw cuts this far from square (16 degrees); the edge of a scan may.
-const MOST_OBLIQUE: f64 = 0.2867;
 /// Faces steeper than a saw that is set square leaves them (7 degrees) are looked for only where the outline is that
 /// oblique too.
 const STEEPEST_FACES: [f64; 2] = [0.1228, MOST_OBLIQUE];

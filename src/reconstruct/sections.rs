@@ -19,7 +19,7 @@ use super::section::{
 };
 use super::seen::{FIRMNESS, FIRST_CUTOFF, group, middle_mm, offs, scatter, see, straighten, sums};
 use super::strangers::{Crowded, Strangers, beset, is_at_an_end, is_oval_untold};
-use crate::recognize::median;
+use crate::recognize::{MEDIAN_TO_SIGMA, median};
 use crate::tube::{Spine, any_normal};
 
 /// The same about a base that has been fitted, radius and ovality and all.
@@ -32,6 +32,9 @@ const SHRINK: f64 = 0.4;
 /// times more than is usual has some of them; and what its radius and ovality may be off at most, in tube radii.
 const DAMAGED_RADII: f64 = 2.0;
 const DAMAGED: f64 = 5.0;
+/// Before anything was fitted a section there is not the tube's when its radius is off the usual one by so many standard deviations of
+/// all sections' radii, and by more than a radius is expected to be.
+const OTHER_RADIUS: f64 = 5.0;
 /// The outermost sections that hold less than this share of the usual points lie where the tube ends: most of theirs are not of its
 /// outside.
 const LEAST_FULL: f64 = 0.25;
@@ -179,6 +182,8 @@ impl CentreLine {
             let (damaged, sound) = damaged_ends(sections, base, &spine, noise);
             places.extend(damaged.iter().map(|s| s.centre));
             sections = sound;
+        } else {
+            sections = of_one_radius(sections, base, &spine, noise);
         }
         let count = sections.iter().map(|s| s.count).sum();
         let crowded = Crowded { places, reach_mm: base.tube_radius_mm.hypot(0.5 * bins.length_mm) };
@@ -383,6 +388,27 @@ fn add_moment(
 /// Whether burr, bore and face may reach a place.
 fn may_be_damaged(base: &TubeModel, spine: &Spine, at_mm: f64) -> bool {
     at_mm.min(spine.length_mm() - at_mm) <= DAMAGED_RADII * base.tube_radius_mm
+}
+
+/// Without the sections near the ends that have another radius than the tube: face and bore outweigh its outside there, and one such
+/// section may draw a whole tube off its way. Where an end straight reaches no farther than that, nothing else tells its direction.
+fn of_one_radius(sections: Vec<Section>, base: &TubeModel, spine: &Spine, noise_mm: f64) -> Vec<Section> {
+    let spreads_mm = SPREADS.map(|s| s * base.tube_radius_mm);
+    let radii: Vec<f64> = sections.iter().map(|s| solve(&s.sums, &spreads_mm, noise_mm)[0]).collect();
+    let usual = median(&mut radii.clone()).unwrap_or(0.0);
+    let mut sizes: Vec<f64> = radii.iter().map(|r| (r - usual).abs()).collect();
+    let scatter = MEDIAN_TO_SIGMA * median(&mut sizes).unwrap_or(0.0);
+    let most = (OTHER_RADIUS * scatter).max(spreads_mm[0]);
+    let reach_mm = DAMAGED_RADII * base.tube_radius_mm;
+    let first_mm = base.lra.bends.first().map_or(spine.length_mm(), |b| b.length_mm);
+    let may_go = |at_mm: f64| {
+        (at_mm <= reach_mm && first_mm > reach_mm)
+            || (spine.length_mm() - at_mm <= reach_mm && base.lra.last_length_mm > reach_mm)
+    };
+    let is_own = |(s, radius): &(Section, f64)| {
+        (radius - usual).abs() <= most || !may_go(spine.closest(&s.centre).arc_length_mm)
+    };
+    sections.into_iter().zip(radii).filter(is_own).map(|(s, _)| s).collect()
 }
 
 /// The sections near the ends that have not the tube's shape, wherever they lie: a burr, a bore, a face is among their points, in

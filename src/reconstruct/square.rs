@@ -5,10 +5,13 @@ use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 
 /// A saw that is set square cuts this square: standard deviation of each component of the slope (0.1 degrees).
 pub const SAW_SPREAD: f64 = 0.0017;
-/// A mitre's slope, or a poor saw's (4 degrees).
-const MITRE_SPREAD: f64 = 0.07;
-/// Share of the ends that are cut square: a saw that is set for a mitre is the rarer one.
-const SQUARE_SHARE: f64 = 0.85;
+/// No saw cuts this far from square (16 degrees).
+pub const MOST_OBLIQUE: f64 = 0.2867;
+/// A mitre's slope, or a poor saw's, may be any up to that: then each component scatters by this (one over the root of 6). A
+/// narrower one would claim to know what an outline leaves open.
+const MITRE_SPREAD: f64 = 0.408 * MOST_OBLIQUE;
+/// Share of the ends that are cut square: there are shops that saw nothing else, and shops that mitre every other end.
+const SQUARE_SHARE: f64 = 0.75;
 /// So many standard deviations are to hold such a share of where the plane may be: as of a normal distribution, but that three
 /// would hold 99.7 %; to have them do so would widen the others to twice what they should be.
 const WITHIN: [(f64, f64); 3] = [(1.0, 0.6827), (2.0, 0.9545), (3.0, 0.99)];
@@ -187,7 +190,7 @@ mod tests {
         let mut lure = Lure { scatter, slopes: vec![Vector2::new(0.01, -0.02); 49] };
         assert!(weigh(&free, &square, &lure).square_share < 0.1);
         lure.slopes.push(Vector2::new(0.18, 0.01));
-        assert!(weigh(&free, &square, &lure).square_share > 0.9);
+        assert!(weigh(&free, &square, &lure).square_share > 0.7);
     }
 
     #[test]
