@@ -171,7 +171,7 @@ pub fn decode_payload(profile: &Profile, payload: &[u8]) -> Result<(String, Comm
     let mut numbers: Vec<[i32; 3]> = (0..count).map(numbers).collect();
     if profile.transport.direct().is_some() {
         // What is behind the last bend is 0.
-        let bends = numbers.iter().rposition(|row| row[2] != 0).map_or(0, |last| last + 1);
+        let bends = numbers.iter().rposition(|row| *row != [0; 3]).map_or(0, |last| last + 1);
         numbers.truncate(bends);
     }
     let table = CommandTable {
@@ -309,6 +309,23 @@ mod tests {
         assert_eq!(payload[at..at + 4], 60_000_i32.to_be_bytes());
         let (_, back) = decode_payload(&p, &payload).unwrap();
         assert!((back.bends[1].rotation_rad.to_degrees() + 60.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_direct_table_goes_to_its_last_row_with_any_number_in_it() {
+        // Found at a machine where only the first of three columns had been written: it was shown as holding nothing.
+        let profile = Profile::load("ten-row").unwrap();
+        let none = CommandTable { bends: Vec::new(), last_length_mm: 0.0 };
+        let mut payload = encode_payload(&profile, "A", &none).unwrap();
+        assert!(decode_payload(&profile, &payload).unwrap().1.bends.is_empty());
+        let header = profile.payload_header_bytes();
+        for (row, feed) in [(0, 120_i32), (1, 270)] {
+            let at = header + row * Profile::ROW_BYTES;
+            payload[at..at + 4].copy_from_slice(&feed.to_be_bytes());
+        }
+        let (_, half) = decode_payload(&profile, &payload).unwrap();
+        let rows: Vec<[f64; 2]> = half.bends.iter().map(|row| [row.length_mm, row.angle_rad]).collect();
+        assert_eq!(rows, [[120.0, 0.0], [150.0, 0.0]]);
     }
 
     #[test]
