@@ -3,7 +3,9 @@
 #![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
 
 use assert_cmd::Command;
-use benderd::bender::{Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, deliver};
+use benderd::bender::{
+    Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, deliver,
+};
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::Door;
@@ -68,6 +70,39 @@ async fn rows_go_in_with_the_operators_approval_and_not_without() {
     assert!(matches!(again, Outcome::AlreadyActive(_)), "{again:?}");
 }
 
+/// What `check --plan` prints: function, first address and count of each request.
+fn printed_requests() -> Vec<[u16; 3]> {
+    let output =
+        Command::cargo_bin("benderd").unwrap().args(["check", "--plan", "ten-row"]).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    let lines = text.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
+    let of = |words: Vec<&str>| {
+        let function = match words[..] {
+            ["read", _, "registers", ..] => 3,
+            ["read", _, "coils", ..] => 1,
+            ["write", ..] => 16,
+            _ => return None,
+        };
+        Some([function, words[3].parse().unwrap(), words[1].parse().unwrap()])
+    };
+    lines.filter_map(of).collect()
+}
+
+#[tokio::test]
+async fn a_delivery_asks_what_the_printed_plan_says() {
+    let (_bender, mut link) = machine().await;
+    assert!(matches!(deliver(&mut link, &job(true), &mut Nothing).await, Outcome::Applied(_)));
+    let request = |line: String| {
+        let frame = line.split_once(" > ")?.1.to_owned();
+        let byte = |word: &str| u16::from_str_radix(word, 16).unwrap();
+        let bytes: Vec<u16> = frame.split(' ').map(byte).collect();
+        let word = |at: usize| bytes[at] << 8 | bytes[at + 1];
+        Some([bytes[7], word(8), word(10)]) // behind the header of Modbus TCP
+    };
+    let asked: Vec<[u16; 3]> = link.last_frames().into_iter().filter_map(request).collect();
+    assert_eq!(asked, printed_requests());
+}
+
 #[tokio::test]
 async fn a_machine_that_runs_or_has_another_die_gets_nothing() {
     let (bender, mut link) = machine().await;
@@ -97,7 +132,7 @@ async fn a_correction_names_what_somebody_changed_at_the_screen() {
 #[tokio::test]
 async fn half_a_table_is_unknown_and_the_next_delivery_makes_it_whole() {
     let (bender, mut link) = machine().await;
-    // Rows, identification, coils, rows again, twice before the commit; then the first column is written, and the second one's answer is lost.
+    // Identification, rows, coils, rows again, twice before the commit; then the first column is written, and the second one's answer is lost.
     let answers = [None; 2 * 8 + 1].into_iter().chain([Some(ReplyFault::Lost)]);
     bender.set_wire_faults(Some(WireFaults::script(answers)));
     let outcome = deliver(&mut link, &job(true), &mut Nothing).await;

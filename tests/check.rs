@@ -179,7 +179,7 @@ fn an_address_that_the_machines_link_has_no_use_for_is_refused() {
 
 #[test]
 fn a_profiles_requests_are_printed() {
-    for profile in ["reference-modbus", "reference-rtu"] {
+    for profile in ["reference-modbus", "reference-rtu", "ten-row"] {
         let output =
             Command::cargo_bin("benderd").unwrap().args(["check", "--plan", profile]).output().unwrap();
         assert_eq!(output.status.code(), Some(0));

@@ -10,7 +10,7 @@ use super::contact::{Event, RulesError};
 use super::link::{ActiveTable, Bender, LinkError};
 use super::modbus_client::ModbusClient;
 use super::open::Opener;
-use super::plan::Request;
+use super::plan;
 use super::profile::Profile;
 use super::wire::{Ack, Staged, Status, TableId, crc_of, staging_image};
 
@@ -60,8 +60,7 @@ impl DirectLink {
     /// The rows as a payload.
     async fn payload(&mut self) -> Result<Vec<u8>, LinkError> {
         let mut columns = Vec::new();
-        for address in self.map.columns {
-            let request = Request { writes: false, address, registers: self.rows() };
+        for request in plan::columns(&self.profile, &self.map, false) {
             columns.push(self.client.read(vec![request]).await?);
         }
         let mut payload = vec![0; self.profile.payload_header_bytes()];
@@ -80,7 +79,7 @@ impl DirectLink {
         let (at, expected) = (self.map.identification, self.profile.identification);
         let mut found = 0;
         for _ in 0..FOREIGN_LOOKS {
-            let bytes = self.client.read(vec![Request { writes: false, address: at, registers: 1 }]).await?;
+            let bytes = self.client.read(vec![plan::constant(&self.map)]).await?;
             found = u32::from(u16::from_be_bytes([bytes[0], bytes[1]]));
             if found == expected {
                 return Ok(());
@@ -94,7 +93,6 @@ impl DirectLink {
     }
 
     async fn status(&mut self, crc: u32) -> Result<Status, LinkError> {
-        self.identify().await?;
         let state = self.client.read_coils(self.map.state_coils, self.map.coils).await?;
         self.client.caller().has_seen();
         Ok(Status {
@@ -154,8 +152,10 @@ impl Bender for DirectLink {
         Ok(())
     }
 
-    /// The rows before and after the state must be the same: nobody was writing.
+    /// Who it is comes first: another machine's rows mean nothing. The rows before and after the state must be the same: nobody was
+    /// writing.
     async fn read_active(&mut self) -> Result<ActiveTable, LinkError> {
+        self.identify().await?;
         let payload = self.payload().await?;
         let status = self.status(crc_of(&payload)).await?;
         if self.payload().await? != payload {

@@ -1,6 +1,7 @@
 //! What a profile makes benderd ask of a machine, request by request: the link makes these requests, `benderd check --plan` prints
 //! them for the PLC programmer.
 
+use super::direct::DirectMap;
 use super::profile::Profile;
 use super::registers::{ModbusMap, status_span};
 use super::wire::payload_bytes;
@@ -47,6 +48,17 @@ pub fn delivery(profile: &Profile, map: &ModbusMap, bends: usize) -> Vec<Step> {
         step("commit, once", vec![Request { writes: true, address: r.commit, registers: 4 }]),
         step("what is in force now", [status(), active].concat()),
     ]
+}
+
+/// The three columns of a machine whose rows are written directly.
+pub fn columns(profile: &Profile, map: &DirectMap, writes: bool) -> [Request; 3] {
+    // The profile's check keeps them below 65536.
+    map.columns.map(|address| Request { writes, address, registers: profile.limits.max_bends as u16 })
+}
+
+/// Its constant.
+pub fn constant(map: &DirectMap) -> Request {
+    Request { writes: false, address: map.identification, registers: 1 }
 }
 
 /// The one request that shows the status.

@@ -22,10 +22,14 @@ fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
     let table = &profile.table;
     writeln!(out, "{}: {}", profile.name, profile.description)?;
     writeln!(out, "  machine   {} at {}", transport(profile), profile.endpoint)?;
+    let direct = profile.transport.direct();
+    let values = match direct {
+        Some(_) => "one register each, signed".to_owned(),
+        None => format!("32-bit values {} (A is the highest byte)", order(table.word_order)),
+    };
     writeln!(
         out,
-        "  numbers   32-bit values {} (A is the highest byte); {} mm and {} degrees a count; rotation {}",
-        order(table.word_order),
+        "  numbers   {values}; {} mm and {} degrees a count; rotation {}",
         table.length_resolution_mm,
         table.angle_resolution_deg,
         if table.rotation_reversed { "left-handed about the feed" } else { "right-handed about the feed" }
@@ -34,7 +38,10 @@ fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
         let (read, write) = (map.max_read_registers, map.max_write_registers);
         writeln!(out, "  requests  read {read} registers at most, write {write}")?;
     }
-    writeln!(out, "  table     up to {bends} bends, {} bytes", payload_bytes(profile, bends))?;
+    match direct {
+        Some(_) => writeln!(out, "  table     {bends} rows, those behind the last bend 0")?,
+        None => writeln!(out, "  table     up to {bends} bends, {} bytes", payload_bytes(profile, bends))?,
+    }
     writeln!(out, "  times     {}", times(profile))?;
     if let Some(map) = profile.transport.modbus() {
         writeln!(out, "\nvalues                     from 0        as 4xxxx")?;
@@ -43,31 +50,60 @@ fn write(out: &mut String, profile: &Profile) -> std::fmt::Result {
             writeln!(out, "  {:<22}   {}", field.name, registers(&span))?;
         }
     }
+    if let Some(map) = direct {
+        write_places(out, profile, map)?;
+    }
     writeln!(out, "\nstate bits that must hold")?;
     for bit in &profile.state_bits {
         writeln!(out, "  bit {:<2} {:<20} {}", bit.bit, bit.name, if bit.must_be { "on" } else { "off" })?;
     }
     match profile.transport.device() {
         Some(Device::Staged(map)) => write_requests(out, profile, map),
-        Some(Device::Direct(map)) => write_columns(out, profile, map),
+        Some(Device::Direct(map)) => write_looks(out, profile, map),
         None => plan_objects::write(out, profile),
     }
 }
 
-fn write_columns(out: &mut String, profile: &Profile, map: &DirectMap) -> std::fmt::Result {
-    let rows = profile.limits.max_bends as u16;
-    writeln!(out, "\nrows, in force as soon as they are written: every write needs the operator's approval")?;
-    writeln!(out, "                           from 0        as 4xxxx")?;
-    let one = |address, registers| Request { writes: false, address, registers };
-    writeln!(out, "  {:<22}   {}", "identification", registers(&one(map.identification, 1)))?;
-    for (name, address) in profile.table.columns.iter().zip(map.columns) {
-        writeln!(out, "  {name:<22}   {}", registers(&one(address, rows)))?;
-    }
-    writeln!(out, "  {:<22}   coils {} to {}", "state", map.state_coils, map.state_coils + map.coils - 1)?;
-    let sequence = |cumulative| if cumulative { "all from the first on" } else { "each from the one before" };
+/// Where a machine without a staging area keeps what.
+fn write_places(out: &mut String, profile: &Profile, map: &DirectMap) -> std::fmt::Result {
     let table = &profile.table;
+    writeln!(out, "\nvalues                     from 0        as 4xxxx")?;
+    writeln!(out, "  {:<22}   {}", "identification", registers(&plan::constant(map)))?;
+    for (name, column) in table.columns.iter().zip(plan::columns(profile, map, false)) {
+        writeln!(out, "  {name:<22}   {}", registers(&column))?;
+    }
+    writeln!(out, "  {:<22}   coils {}", "state", coils(map))?;
+    let sequence = |cumulative| if cumulative { "all from the first on" } else { "each from the one before" };
     writeln!(out, "  {} {}", table.columns[0], sequence(table.feed == Sequence::Cumulative))?;
     writeln!(out, "  {} {}", table.columns[1], sequence(table.rotation == Sequence::Cumulative))
+}
+
+fn coils(map: &DirectMap) -> String {
+    format!("{} to {}", map.state_coils, map.state_coils + map.coils - 1)
+}
+
+/// What is asked of it to put a table in force.
+fn write_looks(out: &mut String, profile: &Profile, map: &DirectMap) -> std::fmt::Result {
+    let rows = profile.limits.max_bends;
+    writeln!(
+        out,
+        "\na delivery of {rows} rows, in force as soon as they are written: every write needs the operator's approval"
+    )?;
+    // Rows before and after the state: nobody was writing.
+    let look = |out: &mut String| {
+        write_request(out, &plan::constant(map))?;
+        plan::columns(profile, map, false).iter().try_for_each(|column| write_request(out, column))?;
+        writeln!(out, "  read  {:>3} coils          {}", map.coils, coils(map))?;
+        plan::columns(profile, map, false).iter().try_for_each(|column| write_request(out, column))
+    };
+    writeln!(out, "1 who is there, and may it be changed")?;
+    look(out)?;
+    writeln!(out, "2 still so")?;
+    look(out)?;
+    writeln!(out, "3 write, once")?;
+    plan::columns(profile, map, true).iter().try_for_each(|column| write_request(out, column))?;
+    writeln!(out, "4 read back: what is in force now")?;
+    look(out)
 }
 
 fn write_requests(out: &mut String, profile: &Profile, map: &ModbusMap) -> std::fmt::Result {
@@ -75,12 +111,14 @@ fn write_requests(out: &mut String, profile: &Profile, map: &ModbusMap) -> std::
     writeln!(out, "\na delivery of {bends} bends     from 0        as 4xxxx")?;
     for (number, step) in plan::delivery(profile, map, bends).iter().enumerate() {
         writeln!(out, "{} {}", number + 1, step.what)?;
-        for request in &step.requests {
-            let does = if request.writes { "write" } else { "read" };
-            writeln!(out, "  {does:<5} {:>3} registers      {}", request.registers, registers(request))?;
-        }
+        step.requests.iter().try_for_each(|request| write_request(out, request))?;
     }
     Ok(())
+}
+
+fn write_request(out: &mut String, request: &Request) -> std::fmt::Result {
+    let does = if request.writes { "write" } else { "read" };
+    writeln!(out, "  {does:<5} {:>3} registers      {}", request.registers, registers(request))
 }
 
 fn registers(request: &Request) -> String {
