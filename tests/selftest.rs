@@ -184,6 +184,26 @@ async fn what_is_wrong_at_the_machine_says_what_to_do() {
     assert!(times.contains("too near to the limit: set deadlines.request_ms = "), "{text}");
 }
 
+/// It advised another word order and to compare the registers.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_busy_machine_is_waited_for_over_every_transport() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = folder.path().join("line").display().to_string();
+    for (profile, on) in [
+        ("reference-modbus", "127.0.0.1:0"),
+        ("ten-row", "127.0.0.1:0"),
+        ("reference-serial", line.as_str()),
+        ("reference-folder", folder.path().to_str().unwrap()),
+    ] {
+        let (busy, _kept) = machine(profile, on, Some(Fault::Busy)).await;
+        let text = said(&selftest(profile, busy.address(), &[]).await, 1);
+        let first = step(&text, "first answer");
+        assert!(first.contains("was busy at") && first.contains("wait and try again"), "{profile}: {text}");
+        assert!(step(&text, "identification").starts_with("skipped"), "{profile}: {text}");
+        assert!(!text.contains("word order") && !text.contains("unit_id"), "{profile}: {text}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn what_cannot_be_opened_says_why() {
     let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
@@ -194,6 +214,12 @@ async fn what_cannot_be_opened_says_why() {
     assert!(step(&text, "endpoint").contains("plug the adapter in, or correct `endpoint`"), "{text}");
     let text = said(&selftest("reference-folder", "/no/such/folder", &[]).await, 1);
     assert!(step(&text, "endpoint").contains("mount the share"), "{text}");
+    // It advised to set a bit rate on an interface of Ethernet.
+    let text = said(&selftest("reference-can", "lo", &[]).await, 1);
+    let endpoint = step(&text, "endpoint");
+    assert!(endpoint.contains("CAN interfaces of this computer: "), "{text}");
+    assert!(endpoint.contains("no CAN interface") || endpoint.contains("modprobe can_raw"), "{text}");
+    assert!(!endpoint.contains("bitrate"), "{text}");
 
     let folder = tempfile::tempdir().unwrap();
     let line = folder.path().join("line").display().to_string();
@@ -225,4 +251,32 @@ async fn a_machine_without_a_staging_area_is_only_read() {
     assert!(step(&text, "write staging").contains("what is written is in force"), "{text}");
     assert!(step(&text, "active table").contains("its rows are all 0"), "{text}");
     assert!(bender.with(|m| m.active_payload()).is_empty(), "nothing was written");
+}
+
+/// It read the rows first and failed at 3523, with "compare identification and layout".
+#[tokio::test(flavor = "multi_thread")]
+async fn a_machine_with_a_staging_area_where_none_is_expected_says_which_registers_to_compare() {
+    let bender = on_socket(None).await;
+    let text = said(&selftest("ten-row", bender.address(), &[]).await, 1);
+    let found = step(&text, "identification");
+    assert!(found.contains("refused reading registers 2520 to 2520: Illegal data address"), "{text}");
+    assert!(found.contains("identification = 2520, length = 3523 to 3532"), "{text}");
+    assert!(found.contains("state_coils = 3073 to 3074") && found.contains("another profile"), "{text}");
+
+    let other_die = changed_ten_row("identification = 60", "identification = 76").await;
+    assert!(other_die.contains("register 2520 holds 60") && other_die.contains("another die"), "{other_die}");
+    assert!(other_die.contains("compare constants.identification = 76"), "{other_die}");
+}
+
+/// What the self-test says of the identification with a changed profile.
+async fn changed_ten_row(from: &str, to: &str) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("changed.toml").display().to_string();
+    let text = include_str!("../protocols/ten-row.toml");
+    assert!(text.contains(from), "the shipped profile no longer contains {from:?}");
+    std::fs::write(&file, text.replacen(from, to, 1)).unwrap();
+    let profile = Profile::load("ten-row").unwrap();
+    let (door, _) = Door::open(&profile, "127.0.0.1:0").await.unwrap();
+    let bender = SimulatedBender::start(door, MachineModel::new(profile, "", 0), None, |_| ()).unwrap();
+    step(&said(&selftest(&file, bender.address(), &[]).await, 1), "identification")
 }

@@ -23,6 +23,9 @@ use super::profile::Profile;
 use super::recording::Frames;
 use super::transport::Transport;
 
+/// What the library says when it finds no frame of RTU in what it heard.
+const NO_FRAME: &str = "Too many retries";
+
 /// One unit behind Modbus.
 pub struct ModbusClient {
     profile: Profile,
@@ -101,6 +104,10 @@ impl ModbusClient {
                 (event, Err(broken(what, explain(&error))))
             }
             // A refusal is a proper answer.
+            Ok(Ok(Err(exception @ (ExceptionCode::ServerDeviceBusy | ExceptionCode::Acknowledge)))) => {
+                let what = format!("{what}: {}", name(exception));
+                (Event::Answered, Err(LinkError::Busy { endpoint, what }))
+            }
             Ok(Ok(Err(exception))) => {
                 (Event::Answered, Err(LinkError::Exception { endpoint, what, exception: name(exception) }))
             }
@@ -115,13 +122,12 @@ impl ModbusClient {
 
     /// The same for requests that may be repeated: "busy" is asked again, a few times, and what a line garbled or lost.
     async fn call_patiently(&mut self, request: Request<'_>) -> Result<Vec<u16>, LinkError> {
-        let busy = [ExceptionCode::ServerDeviceBusy, ExceptionCode::Acknowledge].map(name);
         let pause = Duration::from_millis(self.profile.deadlines.poll_ms);
         let line_retries = if self.profile.transport.line().is_some() { RETRIES } else { 0 };
         let (mut patience, mut repeats, mut failed) = (BUSY_RETRIES, line_retries, None);
         loop {
             match self.call(request.clone()).await {
-                Err(LinkError::Exception { exception, .. }) if patience > 0 && busy.contains(&exception) => {
+                Err(LinkError::Busy { .. }) if patience > 0 => {
                     patience -= 1;
                     tokio::time::sleep(pause).await;
                 }
@@ -248,6 +254,11 @@ fn explain(error: &tokio_modbus::Error) -> String {
         tokio_modbus::Error::Transport(e) if matches!(e.raw_os_error(), Some(0 | 11 | 115)) => {
             "the machine closed the connection".into()
         }
+        tokio_modbus::Error::Transport(e) if e.to_string() == NO_FRAME => {
+            "bytes came that are no frame: compare baud rate, parity, stop bits and unit with the controller's; on RS-485 look for \
+             others that send on the same wires"
+                .into()
+        }
         other => other.to_string(),
     }
 }
@@ -259,6 +270,31 @@ fn name(exception: ExceptionCode) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A line at another baud rate: the error was "Too many retries".
+    #[tokio::test(start_paused = true)]
+    async fn a_line_that_babbles_says_what_to_compare() {
+        use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, duplex};
+        let profile = Profile::load("reference-rtu").unwrap();
+        let (here, mut there) = duplex(65_536);
+        let mut here = Some(here);
+        let opener: Opener = Box::new(move || {
+            let wire = here.take().ok_or(std::io::ErrorKind::NotFound)?;
+            Ok(Box::new(wire) as Box<dyn super::super::line::Wire>)
+        });
+        let mut client = ModbusClient::new(profile, 1, "line".into(), Some(opener)).unwrap();
+        let machine = tokio::spawn(async move {
+            let mut request = [0; 8];
+            while there.read_exact(&mut request).await.is_ok() {
+                there.write_all(&[0x55; 200]).await.unwrap();
+            }
+        });
+        let request = plan::Request { writes: false, address: 0, registers: 36 };
+        let error = client.read(vec![request]).await.unwrap_err().to_string();
+        assert!(error.contains("no frame: compare baud rate, parity"), "{error}");
+        drop(client);
+        machine.await.unwrap();
+    }
 
     #[test]
     fn a_reply_of_another_length_or_place_does_not_fit() {

@@ -18,6 +18,10 @@ use super::{selftest_endpoint as endpoint, selftest_judge as judge};
 /// So many looks for the usual time of an answer.
 const LOOKS: usize = 20;
 
+/// What to do about a machine that answers, and has no time.
+const BUSY: &str = "the machine answers and has no time: wait and try again; if it stays so, another client keeps it busy (a visualization, \
+                    another benderd): stop that";
+
 /// How a step ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -58,6 +62,15 @@ impl Step {
 
     pub(super) fn failed(step: &'static str, found: impl Into<String>, advice: impl Into<String>) -> Step {
         Step { advice: vec![advice.into()], ..Step::new(step, Verdict::Failed, found) }
+    }
+
+    /// An error of the link ended it. A machine that had no time is no reason to change anything.
+    pub(super) fn failed_by(step: &'static str, error: &LinkError, advice: impl Into<String>) -> Step {
+        let advice = match error {
+            LinkError::Busy { .. } => BUSY.to_owned(),
+            _ => advice.into(),
+        };
+        Step::failed(step, error.to_string(), advice)
     }
 
     pub(super) fn with(mut self, figure: &'static str, value: f64) -> Step {
@@ -145,7 +158,7 @@ impl Test<'_> {
         } else {
             let step = match self.heartbeat().await {
                 Ok(step) => step,
-                Err(error) => Step::failed("heartbeat", error.to_string(), "look at cable and plugs"),
+                Err(error) => Step::failed_by("heartbeat", &error, "look at cable and plugs"),
             };
             self.note(step);
         }
@@ -225,6 +238,11 @@ impl Test<'_> {
             }
             Err(error) => error,
         };
+        if let LinkError::Busy { .. } = error {
+            self.note(Step::failed_by("first answer", &error, ""));
+            self.skip(&["identification"], "the machine had no time to answer");
+            return None;
+        }
         let answered = matches!(error, LinkError::Nonsense { .. } | LinkError::Exception { .. });
         if answered {
             self.note(Step::ok("first answer", format!("after {first_ms:.1} ms")).with("first_ms", first_ms));
@@ -245,10 +263,11 @@ impl Test<'_> {
         for _ in 0..LOOKS {
             let begun = Instant::now();
             if let Err(error) = self.link.read_status().await {
-                let found = format!("{} of {LOOKS} answered, then: {error}", times.len());
                 let advice = "the connection is not steady: look at cable, plugs, shield and termination; \
                               --frames shows what arrived";
-                self.note(Step::failed("first answer", found, advice));
+                let mut step = Step::failed_by("first answer", &error, advice);
+                step.found = format!("{} of {LOOKS} answered, then: {error}", times.len());
+                self.note(step);
                 return false;
             }
             times.push(ms_since(begun));
@@ -300,6 +319,10 @@ impl Test<'_> {
             self.note(Step::ok("largest request", found).with("registers", most as f64));
             return;
         };
+        if let LinkError::Busy { .. } = error {
+            self.note(Step::failed_by("largest request", &error, ""));
+            return;
+        }
         // The most that is answered lies from `good` on and below `bad`; both even.
         let (mut good, mut bad) = (0, most);
         while bad - good > 2 {

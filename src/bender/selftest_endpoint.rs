@@ -74,13 +74,29 @@ fn interface(name: &str, fd: bool) -> Opened {
     match Socket::open(name, fd) {
         Ok(_) => Ok("opened"),
         Err(error) => {
+            // What is wrong with it, and the command for that, the error says already.
+            let there = can_interfaces();
+            let there = if there.is_empty() { "none".to_owned() } else { there.join(", ") };
             let advice = format!(
-                "`ip link` shows the interfaces there are; `ip link set {name} up type can bitrate 500000` switches it on with the \
-                 controller's bit rate"
+                "CAN interfaces of this computer: {there}; `endpoint` must name one of them, and that be up"
             );
             Err((error.to_string(), advice))
         }
     }
+}
+
+/// The kernel's number for interfaces of this kind (ARPHRD_CAN).
+const KIND_CAN: &str = "280";
+
+fn can_interfaces() -> Vec<String> {
+    let Ok(entries) = std::fs::read_dir("/sys/class/net") else { return Vec::new() };
+    let is_can =
+        |path: &Path| std::fs::read_to_string(path.join("type")).is_ok_and(|kind| kind.trim() == KIND_CAN);
+    let found = entries.flatten().filter(|entry| is_can(&entry.path()));
+    let mut found: Vec<String> =
+        found.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    found.sort();
+    found
 }
 
 fn unreachable(endpoint: &str) -> String {

@@ -54,6 +54,16 @@ pub fn foreign(profile: &Profile, error: &LinkError, guess: Option<String>) -> S
              and whether it gives {} registers in one read",
             plan::status(profile, map).registers
         ),
+        (LinkError::Exception { .. }, None) if profile.transport.direct().is_some() => format!(
+            "compare [direct] with the controller's list: {}; does this machine have a staging area, so that it needs another profile",
+            direct_places(profile)
+        ),
+        (_, None) if profile.transport.direct().is_some() => format!(
+            "is this the machine, with the die of the profile? If it is, compare constants.identification = {} and [direct] with the \
+             controller's list: {}",
+            profile.identification,
+            direct_places(profile)
+        ),
         (_, Some(map)) => format!(
             "no other word order, address base or usual unit is understood: is this the machine? If it is, compare \
              registers.identification = {} and registers.layout = {}, and the [constants], with the controller's program",
@@ -63,6 +73,22 @@ pub fn foreign(profile: &Profile, error: &LinkError, guess: Option<String>) -> S
     };
     step.advice.push(guess.unwrap_or(other));
     step
+}
+
+/// What a machine without a staging area keeps where.
+fn direct_places(profile: &Profile) -> String {
+    let Some(map) = profile.transport.direct() else { return String::new() };
+    let names = ["length", "rotation", "angle"];
+    let rows = profile.limits.max_bends as u16;
+    let columns =
+        names.iter().zip(map.columns).map(|(name, at)| format!("{name} = {at} to {}", at + (rows - 1)));
+    format!(
+        "identification = {}, {}, state_coils = {} to {}",
+        map.identification,
+        columns.collect::<Vec<_>>().join(", "),
+        map.state_coils,
+        map.state_coils + (map.coils - 1)
+    )
 }
 
 /// The connection opens, and nothing is answered; `guess` is a change that explains it.
@@ -82,7 +108,8 @@ pub fn no_answer(profile: &Profile, endpoint: &str, error: &LinkError, guess: Op
         transport if transport.serial().is_some() => step.advice.extend(line_advice(transport)),
         Transport::Folder(number) => step.advice.push(format!(
             "no answer file bender{number}.ans came in {endpoint}: does the controller look at this folder (its name for the \
-             share may be another), is unit_id = {number} its number, does its program run"
+             share may be another), is unit_id = {number} its number, does its program run, does its clock agree with the share's \
+             (it carries out no command that looks old)"
         )),
         Transport::Can(_) => step.advice.push(format!(
             "no status came on {endpoint}: is the controller on, is its bit rate the interface's (`ip -details link show \
@@ -225,7 +252,7 @@ pub fn active(profile: &Profile, read: Result<ActiveTable, LinkError>) -> Step {
         Err(error) => {
             let advice =
                 format!("compare {} with the controller's list", place_of(profile, "active revision"));
-            return Step::failed(STEP, error.to_string(), advice);
+            return Step::failed_by(STEP, &error, advice);
         }
     };
     if status.active.revision == 0 {
@@ -276,7 +303,7 @@ pub fn staging(profile: &Profile, bytes: usize, read: Result<Vec<u8>, LinkError>
             let advice = format!(
                 "the whole area of {bytes} bytes, from {from} on, must be readable: is it as long there"
             );
-            Step::failed("staging area", error.to_string(), advice)
+            Step::failed_by("staging area", &error, advice)
         }
     }
 }
@@ -316,7 +343,7 @@ pub fn written(
                 ),
                 None => "may the area be written at all? Look at it before the next delivery".into(),
             };
-            return Step::failed(STEP, error.to_string(), advice);
+            return Step::failed_by(STEP, &error, advice);
         }
     };
     if let Some(at) = image

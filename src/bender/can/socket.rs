@@ -124,6 +124,9 @@ fn explain(error: io::Error, interface: &str) -> io::Error {
         return error;
     }
     let advice = match error.raw_os_error() {
+        Some(libc::ENODEV) if std::path::Path::new("/sys/class/net").join(interface).exists() => {
+            format!("{interface} is there and is no CAN interface: `ip -details link show type can` lists those that are")
+        }
         Some(libc::ENODEV) => format!(
             "there is no interface {interface} (any more): plug the adapter in and load its driver; `ip -br link` lists what there \
              is; a virtual one: `ip link add dev {interface} type vcan`"
@@ -151,6 +154,8 @@ mod tests {
     fn each_error_says_what_to_do() {
         let text = |errno| explain(io::Error::from_raw_os_error(errno), "can0").to_string();
         assert!(text(19).starts_with("there is no interface can0"), "{}", text(19));
+        let other = explain(io::Error::from_raw_os_error(19), "lo").to_string();
+        assert!(other.starts_with("lo is there and is no CAN interface"), "{other}");
         assert!(text(97).contains("modprobe can_raw") && text(97).contains("AF_CAN"), "{}", text(97));
         assert!(text(100).contains("ip link set can0 up type can bitrate"), "{}", text(100));
         assert!(text(22).contains("CAN FD"), "{}", text(22));
