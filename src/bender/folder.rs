@@ -68,6 +68,7 @@ impl Protocol for SharedFolder {
             wants,
             answer_ms,
             until_ms: 0,
+            others: 0,
         })
     }
 
@@ -80,7 +81,7 @@ impl Protocol for SharedFolder {
         let (look, oldest) = (Duration::from_millis(deadlines.poll_ms), deadlines.transfer);
         let (folder, number) = (PathBuf::from(endpoint), self.number);
         let port = apart(move || FolderPort::of_daemon(&folder, number, look, oldest)).await?;
-        Ok(port.recorded(self.frames.clone()))
+        Ok(port.recorded(self.frames.clone()).putting_within(deadlines.request))
     }
 }
 
@@ -102,6 +103,8 @@ struct Errand {
     wants: Wants,
     answer_ms: u64,
     until_ms: u64,
+    /// Answers to other commands than this one.
+    others: u32,
 }
 
 impl Errand {
@@ -154,10 +157,18 @@ impl Exchange for Errand {
                 Action::Send { pieces: vec![std::mem::take(&mut self.letter)], until_ms: self.until_ms }
             }
             Event::Timeout => {
-                Action::Failed(Failure::Broken(format!("no answer file within {} ms", self.answer_ms)))
+                let mut why = format!("no answer file within {} ms", self.answer_ms);
+                if self.others > 0 {
+                    why += "; there were answers to other commands: does another program work on this bender's files (a second \
+                            benderd?)";
+                }
+                Action::Failed(Failure::Broken(why))
             }
             Event::Received(letter) => match self.answer(&letter) {
-                None => Action::Send { pieces: Vec::new(), until_ms: self.until_ms },
+                None => {
+                    self.others += 1;
+                    Action::Send { pieces: Vec::new(), until_ms: self.until_ms }
+                }
                 Some(Ok(bytes)) => Action::Done(bytes),
                 Some(Err(failure)) => Action::Failed(failure),
             },
@@ -168,6 +179,20 @@ impl Exchange for Errand {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn answers_to_somebody_elses_commands_are_told_of_when_the_own_one_does_not_come() {
+        let profile = Profile::load("reference-folder").unwrap();
+        let mut protocol = SharedFolder::new(&profile, 1);
+        let mut exchange = protocol.begin(&Ask::Status);
+        exchange.on(Event::Begun, 0);
+        let other = Answer::new(protocol.sequence.wrapping_add(7), Said::Done);
+        let letter = Letter { text: written(&other).0, table: None };
+        let Action::Send { pieces, .. } = exchange.on(Event::Received(letter), 1) else { panic!() };
+        assert!(pieces.is_empty());
+        let Action::Failed(Failure::Broken(why)) = exchange.on(Event::Timeout, 2000) else { panic!() };
+        assert!(why.contains("no answer file") && why.contains("another program"), "{why}");
+    }
 
     #[test]
     fn what_is_behind_a_staged_tables_last_row_reads_as_nothing() {

@@ -6,6 +6,7 @@
 use std::fs::File;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, SystemTime};
 
 use tokio::task::{JoinHandle, spawn_blocking};
@@ -43,6 +44,10 @@ pub struct FolderPort {
     look: Duration,
     /// A letter older than this was meant for a time that is over.
     oldest: Duration,
+    /// A letter is put there within this time, or not at all.
+    latest: Duration,
+    /// Whether a letter that is too old is an error: benderd takes what lay there away before it asks.
+    tells_old: bool,
     /// The next look, and the one that is under way: a call that is cancelled must not lose what it finds.
     next: Instant,
     looking: Option<JoinHandle<io::Result<Option<Letter>>>>,
@@ -52,7 +57,8 @@ pub struct FolderPort {
 impl FolderPort {
     /// benderd's end of what belongs to the bender of this number; the folder is looked at every `look`.
     pub fn of_daemon(folder: &Path, number: u16, look: Duration, oldest: Duration) -> io::Result<FolderPort> {
-        FolderPort::new(folder, number, [("cmd", "tab"), ("ans", "out")], look, oldest)
+        let port = FolderPort::new(folder, number, [("cmd", "tab"), ("ans", "out")], look, oldest)?;
+        Ok(FolderPort { tells_old: true, ..port })
     }
 
     /// The machine's end.
@@ -78,6 +84,7 @@ impl FolderPort {
         }
         let name = |ending: &str| folder.join(format!("bender{number}.{ending}"));
         let [out, back] = endings.map(|(text, table)| Names { text: name(text), table: name(table) });
+        remove_unfinished(folder, &out);
         let next = Instant::now();
         Ok(FolderPort {
             folder: folder.to_owned(),
@@ -85,6 +92,8 @@ impl FolderPort {
             back,
             look,
             oldest,
+            latest: oldest,
+            tells_old: false,
             next,
             looking: None,
             frames: None,
@@ -94,6 +103,12 @@ impl FolderPort {
     /// Keeps the letters that go through it there for a while.
     pub fn recorded(mut self, frames: Frames) -> FolderPort {
         self.frames = Some(frames);
+        self
+    }
+
+    /// What cannot be put there within this time is not put there any more.
+    pub fn putting_within(mut self, latest: Duration) -> FolderPort {
+        self.latest = latest;
         self
     }
 
@@ -119,11 +134,12 @@ impl Port for FolderPort {
     async fn send(&mut self, letter: Letter) -> io::Result<()> {
         self.record(Direction::Sent, &letter);
         let (folder, names) = (self.folder.clone(), self.out.clone());
+        let until = Instant::now() + self.latest;
         apart(move || {
             if let Some(table) = &letter.table {
-                put(&names.table, table)?;
+                put(&names.table, table, until)?;
             }
-            put(&names.text, &letter.text)?;
+            put(&names.text, &letter.text, until)?;
             // The names, too; not every share can.
             let _ = File::open(folder).and_then(|folder| folder.sync_all());
             Ok(())
@@ -136,8 +152,9 @@ impl Port for FolderPort {
             if self.looking.is_none() {
                 sleep_until(self.next).await;
             }
-            let (names, oldest) = (self.back.clone(), self.oldest);
-            let looking = self.looking.get_or_insert_with(|| spawn_blocking(move || take(&names, oldest)));
+            let (names, oldest, tells_old) = (self.back.clone(), self.oldest, self.tells_old);
+            let look = move || take(&names, oldest, tells_old);
+            let looking = self.looking.get_or_insert_with(|| spawn_blocking(look));
             let found = looking.await;
             self.looking = None;
             self.next = Instant::now() + self.look;
@@ -164,42 +181,98 @@ pub(super) async fn apart<T: Send + 'static>(
     spawn_blocking(work).await.map_err(io::Error::other)?
 }
 
-/// All of it under this name, or nothing.
-fn put(name: &Path, bytes: &[u8]) -> io::Result<()> {
+/// All of it under this name, or nothing. It outlives a caller who has given up, and its time in the folder begins when it is written:
+/// so what a share held up for too long is not put there any more.
+fn put(name: &Path, bytes: &[u8], until: Instant) -> io::Result<()> {
+    let new = unfinished(name);
+    let written = File::create(&new).and_then(|mut file| {
+        file.write_all(bytes)?;
+        file.sync_all()
+    });
+    let done = match written {
+        Err(error) => Err(at(name, "cannot be written", &error)),
+        Ok(()) if Instant::now() >= until => {
+            let why =
+                format!("{} is not put there any more: the share took too long to write it", name.display());
+            Err(io::Error::new(io::ErrorKind::TimedOut, why))
+        }
+        Ok(()) => std::fs::rename(&new, name).map_err(|error| at(name, "cannot be put there", &error)),
+    };
+    if done.is_err() {
+        let _ = std::fs::remove_file(new); // it is in nobody's way
+    }
+    done
+}
+
+/// The name under which a file is written: no other of this program nor of another one writes under it.
+fn unfinished(name: &Path) -> PathBuf {
+    static COUNT: AtomicU32 = AtomicU32::new(0);
     let mut new = name.as_os_str().to_owned();
-    new.push(".new");
-    let mut file = File::create(&new)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    std::fs::rename(new, name)
+    new.push(format!(".{}-{}.new", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
+    PathBuf::from(new)
+}
+
+/// What a program that died, or a share that hung, has left under such names.
+fn remove_unfinished(folder: &Path, names: &Names) {
+    let Ok(entries) = std::fs::read_dir(folder) else { return };
+    for path in entries.flatten().map(|entry| entry.path()) {
+        let begins = |name: &Path| {
+            path.with_extension("").with_extension("") == name || path.with_extension("") == name
+        };
+        if path.extension().is_some_and(|e| e == "new") && (begins(&names.text) || begins(&names.table)) {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
+/// The system's error with the file, and what may be behind it.
+fn at(name: &Path, what: &str, error: &io::Error) -> io::Error {
+    let suspicion = match error.kind() {
+        io::ErrorKind::NotFound => {
+            ": the share is gone, or another program works on this bender's files (a second benderd?)"
+        }
+        _ => "",
+    };
+    io::Error::new(error.kind(), format!("{} {what}: {error}{suspicion}", name.display()))
 }
 
 /// The letter that lies there; it is taken away.
-fn take(names: &Names, oldest: Duration) -> io::Result<Option<Letter>> {
+fn take(names: &Names, oldest: Duration, tells_old: bool) -> io::Result<Option<Letter>> {
     let Some((text, written)) = read(&names.text)? else { return Ok(None) };
     let table = read(&names.table)?.map(|(table, _)| table);
     remove(&names.text)?;
     remove(&names.table)?;
     // A clock that went back makes nothing old.
     let age = SystemTime::now().duration_since(written).unwrap_or_default();
+    if age > oldest && tells_old {
+        let why = format!(
+            "{}: an answer {} s old by its own time was taken away: compare the clocks of the share and of this computer",
+            names.text.display(),
+            age.as_secs()
+        );
+        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+    }
     Ok((age <= oldest).then_some(Letter { text, table }))
 }
 
 fn read(name: &Path) -> io::Result<Option<(Vec<u8>, SystemTime)>> {
     let about = match std::fs::metadata(name) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        about => about?,
+        about => about.map_err(|error| at(name, "cannot be looked at", &error))?,
     };
     if about.len() > LONGEST {
         let why = format!("{} has {} bytes, allowed are {LONGEST}", name.display(), about.len());
         return Err(io::Error::new(io::ErrorKind::InvalidData, why));
     }
-    Ok(Some((std::fs::read(name)?, about.modified()?)))
+    let bytes = std::fs::read(name).map_err(|error| at(name, "cannot be read", &error))?;
+    Ok(Some((bytes, about.modified()?)))
 }
 
 fn remove(name: &Path) -> io::Result<()> {
     match std::fs::remove_file(name) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(at(name, "cannot be taken away", &error))
+        }
         _ => Ok(()),
     }
 }
@@ -266,6 +339,64 @@ mod tests {
         let found = tokio::time::timeout(Duration::from_secs(1), machine.receive()).await;
         assert!(found.is_err(), "{found:?}");
         assert!(files(folder.path()).is_empty());
+    }
+
+    /// A share that hung let an old command appear: it was given up, and its file was fresh.
+    #[tokio::test(start_paused = true)]
+    async fn what_took_too_long_to_write_is_not_put_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let (daemon, _) = ends(folder.path(), Duration::from_secs(60));
+        let letter = Letter { text: b"commit".to_vec(), table: Some(b"rows".to_vec()) };
+        let error = daemon.putting_within(Duration::ZERO).send(letter).await.unwrap_err().to_string();
+        assert!(error.contains("bender7.tab is not put there any more: the share took too long"), "{error}");
+        assert!(files(folder.path()).is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn an_answer_that_looks_old_tells_of_the_clocks() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut daemon, mut machine) = ends(folder.path(), Duration::from_secs(60));
+        machine.send(Letter { text: b"done".to_vec(), table: None }).await.unwrap();
+        let file = File::options().write(true).open(folder.path().join("bender7.ans")).unwrap();
+        file.set_modified(SystemTime::now() - Duration::from_secs(3600)).unwrap();
+        let error = daemon.receive().await.unwrap_err().to_string();
+        assert!(
+            error.contains("bender7.ans: an answer 3600 s old by its own time was taken away"),
+            "{error}"
+        );
+        assert!(error.contains("compare the clocks"), "{error}");
+        assert!(files(folder.path()).is_empty());
+    }
+
+    /// It was "No such file or directory (os error 2)".
+    #[tokio::test(start_paused = true)]
+    async fn a_file_that_another_program_took_is_named() {
+        let error = at(
+            Path::new("f/bender7.cmd"),
+            "cannot be put there",
+            &io::Error::from_raw_os_error(libc::ENOENT),
+        );
+        let said = "f/bender7.cmd cannot be put there: No such file or directory (os error 2): the share is gone, or another \
+                    program works on this bender's files (a second benderd?)";
+        assert_eq!(error.to_string(), said);
+        assert_eq!(error.kind(), io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn what_was_left_unfinished_is_taken_away_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let kept = ["bender7.ans.1-1.new", "bender7.cmdx.1-1.new", "bender70.cmd.1-1.new", "other.new"];
+        for name in
+            kept.into_iter().chain(["bender7.cmd.new", "bender7.cmd.1-1.new", "bender7.tab.4711-12.new"])
+        {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        let names = ["cmd", "tab"].map(|ending| folder.path().join(format!("bender7.{ending}")));
+        remove_unfinished(folder.path(), &Names { text: names[0].clone(), table: names[1].clone() });
+        assert_eq!(files(folder.path()), kept);
+        assert_ne!(unfinished(&names[0]), unfinished(&names[0]));
+        let new = unfinished(&names[0]).file_name().unwrap().to_string_lossy().into_owned();
+        assert!(new.starts_with("bender7.cmd.") && new.ends_with(".new"), "{new}");
     }
 
     #[tokio::test(start_paused = true)]

@@ -108,7 +108,7 @@ async fn serve_door(door: Door, shared: Arc<Shared>) {
         }
         Door::Folder(mut port, _, profile) => {
             let mut station = FolderStation::new(*profile);
-            while serve(&mut port, &mut station, &shared).await == Ended::HungUp {}
+            while serve(&mut *port, &mut station, &shared).await == Ended::HungUp {}
         }
         Door::Bus(mut join, _, profile) => loop {
             match (join(), &profile.transport) {

@@ -23,7 +23,7 @@ pub enum Door {
     /// Wires in memory, one after the other.
     Memory(Speech, UnboundedReceiver<DuplexStream>),
     /// The machine's end of a folder, which people know by this name, and what kind of machine.
-    Folder(FolderPort, String, Box<Profile>),
+    Folder(Box<FolderPort>, String, Box<Profile>),
     /// A place on a bus, which people know by this name; taken anew when it is lost.
     Bus(BusDoor, String, Box<Profile>),
 }
@@ -87,7 +87,7 @@ impl Door {
     /// The machine's end of a folder.
     pub fn folder(profile: &Profile, number: u16, on: &str) -> io::Result<Door> {
         let port = FolderPort::of_machine(Path::new(on), number, CYCLE, profile.deadlines.request)?;
-        Ok(Door::Folder(port, on.to_owned(), Box::new(profile.clone())))
+        Ok(Door::Folder(Box::new(port), on.to_owned(), Box::new(profile.clone())))
     }
 
     /// What a link is told to reach it.
