@@ -40,6 +40,25 @@ fn it_says_where_it_listens_logs_commits_and_stops_on_sigterm() {
     assert!(bender.wait().unwrap().success());
 }
 
+/// It said "cannot listen: No such file or directory" and "invalid port value", and nothing of what there may be instead.
+#[test]
+fn where_it_cannot_listen_it_says_what_is_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    for (profile, on, said) in [
+        ("reference-rtu", "/no/such/folder/line", "--on ./line"),
+        ("reference-serial", "/no/such/folder/line", "--on ./line"),
+        ("reference-modbus", "127.0.0.1:99999", "a port of 0 (a free one is taken) to 65535"),
+        ("reference-folder", "nowhere", "a folder that is there"),
+        ("reference-can", "nocan7", "a CAN interface that is up"),
+    ] {
+        let args = ["simulate", "bender", "--profile", profile, "--on", on];
+        let output = benderd().current_dir(folder.path()).args(args).output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{profile}: {text}");
+        assert!(text.contains(&format!("--on {on}: cannot listen: ")) && text.contains(said), "{text}");
+    }
+}
+
 #[test]
 fn what_a_script_says_is_printed_when_it_happens() {
     let folder = tempfile::tempdir().unwrap();

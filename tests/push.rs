@@ -389,6 +389,71 @@ async fn profile_and_journal_must_be_usable_before_anything_is_sent() {
     assert!(shop.untouched());
 }
 
+/// As the contracts print it: `--on ./line`.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_path_begins_where_the_command_is_given() {
+    for (bender, on) in
+        [("reference-rtu", "./line"), ("reference-serial", "line"), ("reference-folder", "folder")]
+    {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("folder")).unwrap();
+        std::fs::write(folder.path().join("bracket.csv"), LRA).unwrap();
+        let profile = Profile::load(bender).unwrap();
+        let place = folder.path().join(on).display().to_string();
+        let (door, _kept) = Door::open(&profile, &place).await.unwrap();
+        let _machine =
+            SimulatedBender::start(door, MachineModel::new(profile, "bracket", 2), None, |_| ()).unwrap();
+        let args = ["push", "bracket.csv", "--bender", bender, "--on", on, "--journal", "journal.db"];
+        let output = run(folder.path(), &args).await;
+        assert_eq!(code(&output), 0, "{bender}: {}", stderr(&output));
+        assert!(stdout(&output).contains("applied"), "{bender}: {}", stdout(&output));
+    }
+    // What is no path stays as it is.
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("bracket.csv"), LRA).unwrap();
+    for (bender, on) in [("reference-can", "./can0"), ("reference-modbus", "./line")] {
+        let output = run(folder.path(), &["push", "bracket.csv", "--bender", bender, "--on", on]).await;
+        assert_eq!(code(&output), 2);
+        assert!(stderr(&output).contains(&format!("--on {on}: allowed is ")), "{}", stderr(&output));
+    }
+}
+
+/// A read that never ends in one of its threads kept the program for ever, after it had said all.
+#[test]
+fn a_share_that_hangs_does_not_keep_it_from_ending() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("bracket.csv"), LRA).unwrap();
+    let text = include_str!("../protocols/reference-folder.toml")
+        .replace("transfer_ms = 10000", "transfer_ms = 3000")
+        .replace("connect_ms = 2000", "connect_ms = 500");
+    std::fs::write(at("quick.toml"), text).unwrap();
+    let share = at("share");
+    std::fs::create_dir(&share).unwrap();
+    let (command, answer) = (share.join("bender1.cmd"), share.join("bender1.ans"));
+    let over = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let told = over.clone();
+    // The answer is a pipe that nobody writes to.
+    let machine = std::thread::spawn(move || {
+        while !command.exists() && !told.load(std::sync::atomic::Ordering::Relaxed) {
+            std::thread::yield_now();
+        }
+        std::process::Command::new("mkfifo").arg(&answer).status().unwrap().success()
+    });
+    let output = Command::cargo_bin("benderd")
+        .unwrap()
+        .current_dir(folder.path())
+        .args(["push", "bracket.csv", "--bender", "quick.toml", "--on", "share", "--journal", "journal.db"])
+        .timeout(std::time::Duration::from_secs(60))
+        .output()
+        .unwrap();
+    over.store(true, std::sync::atomic::Ordering::Relaxed);
+    assert!(machine.join().unwrap());
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    assert!(stderr(&output).contains("no answer"), "{}", stderr(&output));
+    assert_eq!(kinds(&at("journal.db")), ["outcome"], "the record is whole");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_journal_has_its_place_without_being_told() {
     let shop = Shop::open(None).await;

@@ -54,6 +54,11 @@ impl Transport {
         }
     }
 
+    /// Whether that form is a file's path.
+    pub fn is_path(&self) -> bool {
+        self.serial().is_some() || matches!(self, Transport::Folder(_))
+    }
+
     /// That form in words.
     pub fn form(&self) -> &'static str {
         match self {

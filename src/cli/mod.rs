@@ -20,12 +20,16 @@ mod selftest;
 mod simulate;
 mod simulate_bender;
 
+use std::future::Future;
 use std::io::{ErrorKind, Write};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use clap::{Parser, Subcommand};
+use tokio::runtime::Runtime;
 
+use crate::bender::Profile;
 use crate::cloud::Unit;
 
 /// Closes the loop on CNC tube bending.
@@ -107,6 +111,29 @@ fn say(text: &str) {
     {
         eprintln!("error: the output cannot be written: {error}");
     }
+}
+
+/// How long file work that nobody waits for any more may go on before the program ends.
+const LEFT_OVER: Duration = Duration::from_secs(1);
+
+/// Runs this to its end; a thread that hangs at a share does not keep the program from ending.
+fn run_on<T>(runtime: Runtime, work: impl Future<Output = T>) -> T {
+    let result = runtime.block_on(work);
+    runtime.shutdown_timeout(LEFT_OVER);
+    result
+}
+
+/// Where the machine is: as given, where a path begins at this folder, or as its profile says.
+fn endpoint_of(profile: &Profile, on: Option<&str>) -> anyhow::Result<String> {
+    let Some(on) = on else { return Ok(profile.endpoint.clone()) };
+    let endpoint = match std::path::absolute(on) {
+        Ok(path) if profile.transport.is_path() => path.display().to_string(),
+        _ => on.to_owned(),
+    };
+    if !profile.transport.takes(&endpoint) {
+        anyhow::bail!("--on {on}: allowed is {}", profile.transport.form());
+    }
+    Ok(endpoint)
 }
 
 /// Whether an error only says that nobody reads the output any more.

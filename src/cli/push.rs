@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, anyhow, bail};
 use serde::{Deserialize, Serialize};
 
-use super::{Outcome as Exit, push_text, say};
+use super::{Outcome as Exit, endpoint_of, push_text, run_on, say};
 use crate::bender::{
     ActiveTable, Bender as _, Intent, IntentLog as _, Job, Link, Operation, Outcome, Profile, Reason, Status,
     TableId, check_program, deliver, gate, objections, prepare,
@@ -25,7 +25,7 @@ pub struct Args {
     /// What kind of machine: a shipped profile's name or a profile file.
     #[arg(long, value_name = "PROFILE")]
     bender: String,
-    /// Where the machine is [default: the profile's endpoint].
+    /// Where the machine is; a path begins at this folder [default: the profile's endpoint].
     #[arg(long, value_name = "ADDRESS")]
     on: Option<String>,
     /// The program that must be loaded [default: the table's file name without its ending].
@@ -99,10 +99,7 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     };
     check_program(&profile, &program)
         .map_err(|reason| anyhow!("{reason}; give the machine's own with --program NAME"))?;
-    let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
-    if !profile.transport.takes(&endpoint) {
-        bail!("--on {endpoint}: allowed is {}", profile.transport.form());
-    }
+    let endpoint = endpoint_of(&profile, args.on.as_deref())?;
     let mut report = Report {
         bender: profile.name.clone(),
         endpoint: endpoint.clone(),
@@ -134,7 +131,7 @@ pub fn run(args: &Args) -> anyhow::Result<Exit> {
     let job = Job { program, table, expected_active: None, operation, approved: args.approve };
     let mut link = Link::new(profile, endpoint)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let report = runtime.block_on(push(args, &mut link, job, journal.as_mut(), report));
+    let report = run_on(runtime, push(args, &mut link, job, journal.as_mut(), report));
     finish(args, &report)
 }
 

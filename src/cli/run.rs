@@ -12,8 +12,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::{broadcast, mpsc};
 use tokio::task::JoinSet;
 
-use super::Outcome;
 use super::check::load;
+use super::{Outcome, run_on};
 use crate::arm::WatchedFolder;
 use crate::bender::Link;
 use crate::cell::{Chain, Command, Driver, Notice, Setup};
@@ -37,13 +37,14 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     let state_dir = &loaded.config.state_dir;
     std::fs::create_dir_all(state_dir).with_context(|| format!("{}: cannot be made", state_dir.display()))?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-    runtime.block_on(async {
+    let daemon = async {
         let mut daemon = Daemon::default();
         for setup in loaded.setups {
             daemon.start(setup, &state_dir.join("journal.db")).await?;
         }
         daemon.run(args.arm).await
-    })
+    };
+    run_on(runtime, daemon)
 }
 
 /// To stderr, where journald adds the time itself.

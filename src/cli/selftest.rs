@@ -1,9 +1,8 @@
 //! `benderd selftest`: what a fitter runs at a real machine.
 
-use anyhow::bail;
 use serde::Serialize;
 
-use super::{Outcome, say};
+use super::{Outcome, endpoint_of, run_on, say};
 use crate::bender::Profile;
 use crate::bender::selftest::{Report, Step, Verdict, run as test};
 
@@ -13,7 +12,7 @@ pub struct Args {
     /// What kind of machine: a shipped profile's name or a profile file.
     #[arg(long, value_name = "PROFILE")]
     bender: String,
-    /// Where the machine is [default: the profile's endpoint].
+    /// Where the machine is; a path begins at this folder [default: the profile's endpoint].
     #[arg(long, value_name = "ADDRESS")]
     on: Option<String>,
     /// Also stages a test pattern, reads it back and clears it. It cannot be committed.
@@ -42,10 +41,7 @@ struct Printed<'a> {
 /// Runs the subcommand.
 pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     let profile = Profile::load(&args.bender)?;
-    let endpoint = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
-    if !profile.transport.takes(&endpoint) {
-        bail!("--on {endpoint}: allowed is {}", profile.transport.form());
-    }
+    let endpoint = endpoint_of(&profile, args.on.as_deref())?;
     let writes = if args.write_staging { "only the staging area is written" } else { "nothing is written" };
     if !args.json {
         say(&format!("selftest of {} at {endpoint}: {writes}, nothing is committed", profile.name));
@@ -56,7 +52,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let report = runtime.block_on(test(&profile, &endpoint, args.write_staging, &mut tell))?;
+    let report = run_on(runtime, test(&profile, &endpoint, args.write_staging, &mut tell))?;
     if args.json {
         let printed = Printed {
             bender: &profile.name,

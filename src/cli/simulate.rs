@@ -21,7 +21,7 @@ pub struct Args {
 enum Simulator {
     /// Scans a part as if it had been bent perfectly, with a simulated laser line.
     Scan(ScanArgs),
-    /// A bender with a real Modbus TCP server, until Ctrl-C.
+    /// A bender on the link that its profile names (Modbus, a serial line, a folder, CAN), until Ctrl-C.
     Bender(simulate_bender::Args),
 }
 

@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context as _, bail};
+use anyhow::{anyhow, bail};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{Outcome, say};
-use crate::bender::Profile;
+use super::{Outcome, run_on, say};
+use crate::bender::{Profile, Transport};
 use crate::sim::bender::{MachineEvent, MachineModel};
 use crate::sim::bender_server::SimulatedBender;
 use crate::sim::door::Door;
@@ -60,13 +60,14 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         (None, seed) => seed.map(|seed| WireFaults::by_chance(&profile, seed, args.per_mille)),
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    runtime.block_on(serve(args, profile, faults))
+    run_on(runtime, serve(args, profile, faults))
 }
 
 async fn serve(args: &Args, profile: Profile, faults: Option<WireFaults>) -> anyhow::Result<Outcome> {
     let on = args.on.clone().unwrap_or_else(|| profile.endpoint.clone());
-    let (door, _kept) =
-        Door::open(&profile, &on).await.with_context(|| format!("--on {on}: cannot listen"))?;
+    let (door, _kept) = Door::open(&profile, &on).await.map_err(|error| {
+        anyhow!("--on {on}: cannot listen: {error}; allowed is {}", form(&profile.transport))
+    })?;
     let name = profile.name.clone();
     let model = MachineModel::new(profile, &args.program, args.bends);
     let bender = SimulatedBender::start(door, model, args.fault, |event| say(&describe(&event)))?;
@@ -84,6 +85,20 @@ async fn serve(args: &Args, profile: Profile, faults: Option<WireFaults>) -> any
     }
     say("stopped");
     Ok(Outcome::Done)
+}
+
+/// What `--on` takes, in words.
+fn form(transport: &Transport) -> &'static str {
+    match transport {
+        Transport::ModbusTcp(_) | Transport::ModbusRtuOverTcp(..) => {
+            "an address of this computer and a port of 0 (a free one is taken) to 65535, for instance 127.0.0.1:5020"
+        }
+        Transport::ModbusRtu(..) | Transport::SerialTable(..) => {
+            "the path of a serial port, or a name for a pseudo terminal that is made where it may be: --on ./line"
+        }
+        Transport::Folder(_) => "a folder that is there: mkdir folder, then --on ./folder",
+        Transport::Can(_) | Transport::Canopen(_) => "a CAN interface that is up, for instance vcan0",
+    }
 }
 
 fn describe(event: &MachineEvent) -> String {
