@@ -20,6 +20,15 @@ fn numbers(path: &Path) -> Vec<Vec<f64>> {
     text.lines().skip(1).map(|l| l.split(',').map(cell).collect()).collect()
 }
 
+/// The contracts' "Trying it out" delivers it.
+#[test]
+fn the_shipped_table_is_the_shipped_part() {
+    use benderd::config::{Materials, Table, load_part, read_table};
+    let parts = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/parts");
+    let Table::Lra(table) = read_table(&parts.join("bracket-17.csv")).unwrap() else { panic!("not LRA") };
+    assert_eq!(table, load_part(&parts.join("bracket-17.toml"), &Materials::shipped().unwrap()).unwrap().lra);
+}
+
 #[test]
 fn all_ways_round_and_back() {
     let dir = tempfile::tempdir().unwrap();
