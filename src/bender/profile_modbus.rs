@@ -15,15 +15,22 @@ use crate::config::{At, ConfigError, Document};
 #[derive(Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RawModbus {
-    /// Of 32-bit values, A being the highest byte.
-    pub word_order: RawWordOrder,
+    /// Of 32-bit values, A being the highest byte; [direct] has none.
+    word_order: Option<At<RawWordOrder>>,
     max_read_registers: At<i64>,
     max_write_registers: At<i64>,
 }
 
+impl RawModbus {
+    /// Of 32-bit values; where the file says nothing, the highest byte first.
+    pub fn word_order(&self) -> WordOrder {
+        self.word_order.as_ref().map_or(WordOrder::Abcd, |order| (*order.get_ref()).into())
+    }
+}
+
 #[derive(Clone, Copy, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum RawWordOrder {
+enum RawWordOrder {
     Abcd,
     Cdab,
     Badc,
@@ -71,13 +78,29 @@ pub fn parse_direct(
     rows: i64,
     coils: u16,
 ) -> Result<DirectMap, ConfigError> {
+    if let Some(order) = &modbus.word_order
+        && modbus.word_order() != WordOrder::Abcd
+    {
+        let found = doc.text().get(order.span()).unwrap_or("");
+        let allowed =
+            "nothing, or \"abcd\": the numbers of [direct] are of one register each, its high byte first";
+        return Err(doc.value_error(order.span(), "modbus.word_order", found, allowed));
+    }
     let column = |value: &At<i64>, key: &str| -> Result<u16, ConfigError> {
         Ok(integer(doc, value, &format!("direct.{key}"), 0..=0x10000 - rows)? as u16)
     };
     // A column that is written in two requests could be left half old, half new.
     integer(doc, &modbus.max_write_registers, "modbus.max_write_registers", rows..=123)?;
     integer(doc, &modbus.max_read_registers, "modbus.max_read_registers", rows..=125)?;
-    Ok(DirectMap {
+    let area = |address, key, registers| Area { section: "direct", address, key, registers };
+    let rows = rows as usize;
+    let mut areas = [
+        area(&raw.identification, "identification", 1),
+        area(&raw.length, "length", rows),
+        area(&raw.rotation, "rotation", rows),
+        area(&raw.angle, "angle", rows),
+    ];
+    let map = DirectMap {
         unit_id: integer(doc, unit_id, "unit_id", 0..=255)? as u8,
         identification: integer(doc, &raw.identification, "direct.identification", 0..=0xffff)? as u16,
         state_coils: integer(doc, &raw.state_coils, "direct.state_coils", 0..=0x10000 - 16)? as u16,
@@ -87,7 +110,9 @@ pub fn parse_direct(
             column(&raw.rotation, "rotation")?,
             column(&raw.angle, "angle")?,
         ],
-    })
+    };
+    check_overlap(doc, &mut areas)?;
+    Ok(map)
 }
 
 impl From<RawWordOrder> for WordOrder {
@@ -108,6 +133,11 @@ pub fn parse_modbus(
     raw: &RawModbus,
     registers: &RawRegisters,
 ) -> Result<ModbusMap, ConfigError> {
+    if raw.word_order.is_none() {
+        let at = &raw.max_read_registers;
+        let allowed = "with word_order beside it: \"abcd\", \"cdab\", \"badc\" or \"dcba\"";
+        return Err(doc.value_error(at.span(), "modbus.max_read_registers", at.get_ref(), allowed));
+    }
     // Every 32-bit value lies at an even distance from its area's start, so an even limit never splits one.
     let even = |value: &At<i64>, key, max| Ok(integer(doc, value, key, 4..=max)? as u16 & !1);
     Ok(ModbusMap {
@@ -141,6 +171,7 @@ fn parse_registers(doc: &Document, raw: &RawRegisters) -> Result<Registers, Conf
 
 /// One group of registers: the address as written in the file, its key, how many.
 struct Area<'a> {
+    section: &'static str,
     address: &'a At<i64>,
     key: &'static str,
     registers: usize,
@@ -156,13 +187,13 @@ impl Area<'_> {
     }
 
     fn complaint(&self, doc: &Document, allowed: String) -> ConfigError {
-        doc.value_error(self.address.span(), &format!("registers.{}", self.key), self.start(), allowed)
+        doc.value_error(self.address.span(), &format!("{}.{}", self.section, self.key), self.start(), allowed)
     }
 }
 
 fn areas<'a>(r: &'a RawRegisters, profile: &Profile) -> Vec<Area<'a>> {
     let payload = (profile.payload_header_bytes() + profile.limits.max_bends * Profile::ROW_BYTES) / 2;
-    let area = |address, key, registers| Area { address, key, registers };
+    let area = |address, key, registers| Area { section: "registers", address, key, registers };
     vec![
         area(&r.identification, "identification", 2),
         area(&r.layout, "layout", 1),
@@ -180,6 +211,21 @@ fn areas<'a>(r: &'a RawRegisters, profile: &Profile) -> Vec<Area<'a>> {
     ]
 }
 
+/// Sorts areas by where they begin; no two overlap, and all fit.
+fn check_overlap(doc: &Document, areas: &mut [Area<'_>]) -> Result<(), ConfigError> {
+    areas.sort_by_key(Area::start);
+    if let Some(area) = areas.iter().find(|a| a.end() > 0x10000) {
+        let allowed = format!("at most {}: it takes {} registers", 0x10000 - area.registers, area.registers);
+        return Err(area.complaint(doc, allowed));
+    }
+    match areas.iter().zip(areas.iter().skip(1)).find(|(a, b)| a.end() > b.start()) {
+        Some((before, area)) => {
+            Err(area.complaint(doc, format!("{} or more: {} ends there", before.end(), before.key)))
+        }
+        None => Ok(()),
+    }
+}
+
 /// No two areas overlap, all fit, and one read covers the status.
 pub fn check_areas(
     doc: &Document,
@@ -188,14 +234,7 @@ pub fn check_areas(
     map: &ModbusMap,
 ) -> Result<(), ConfigError> {
     let mut areas = areas(raw, profile);
-    areas.sort_by_key(Area::start);
-    if let Some(area) = areas.iter().find(|a| a.end() > 0x10000) {
-        let allowed = format!("at most {}: it takes {} registers", 0x10000 - area.registers, area.registers);
-        return Err(area.complaint(doc, allowed));
-    }
-    if let Some((before, area)) = areas.iter().zip(areas.iter().skip(1)).find(|(a, b)| a.end() > b.start()) {
-        return Err(area.complaint(doc, format!("{} or more: {} ends there", before.end(), before.key)));
-    }
+    check_overlap(doc, &mut areas)?;
     let mut status = areas.iter().filter(|a| !matches!(a.key, "staging" | "active"));
     let first = status.clone().map(Area::start).min().unwrap_or(0);
     let most = map.max_read_registers;
@@ -232,6 +271,39 @@ mod tests {
         assert!(parse(&TEXT.replace("active = 2000", "active = 65276")).is_ok());
         assert!(complaint("commit = 32", "commit = 121").contains("one read of 124 registers"));
         assert!(parse(&TEXT.replace("commit = 32", "commit = 120")).is_ok());
+    }
+
+    /// Found: the rows of such a machine take the low register's two bytes, which another order fills with the high ones.
+    #[test]
+    fn a_map_without_a_staging_area_has_no_word_order() {
+        const TEN: &str = include_str!("../../protocols/ten-row.toml");
+        let with =
+            |order: &str| parse(&TEN.replacen("[modbus]", &format!("[modbus]\nword_order = \"{order}\""), 1));
+        assert!(!TEN.contains("word_order") && with("abcd").is_ok());
+        for order in ["cdab", "badc", "dcba"] {
+            let text = with(order).unwrap_err();
+            let said = format!("modbus.word_order = \"{order}\", allowed is nothing, or \"abcd\"");
+            assert!(text.contains(&said), "{text}");
+        }
+        let text = complaint("word_order = \"abcd\"", "");
+        assert!(text.contains("modbus.max_read_registers = 125, allowed is with word_order"), "{text}");
+    }
+
+    #[test]
+    fn columns_that_overlap_are_refused_and_the_neighbour_is_not() {
+        const TEN: &str = include_str!("../../protocols/ten-row.toml");
+        let complaint = |from, to| complaint_of(TEN, from, to);
+        let text = complaint("rotation = 3583", "rotation = 3525");
+        assert!(
+            text.contains("direct.rotation = 3525, allowed is 3533 or more: length ends there"),
+            "{text}"
+        );
+        let text = complaint("angle = 3553", "angle = 3583");
+        assert!(text.contains("direct.angle = 3583, allowed is 3593 or more: rotation ends there"), "{text}");
+        let text = complaint("identification = 2520", "identification = 3532");
+        assert!(text.contains("direct.identification = 3532, allowed is 3533 or more"), "{text}");
+        assert!(parse(&TEN.replacen("rotation = 3583", "rotation = 3533", 1)).is_ok());
+        assert!(parse(&TEN.replacen("identification = 2520", "identification = 3533", 1)).is_ok());
     }
 
     #[test]

@@ -95,7 +95,7 @@ pub enum RawMap<'a> {
 impl Sections<'_> {
     /// Of 32-bit values; where the file says nothing, the highest byte first.
     pub fn word_order(&self) -> WordOrder {
-        self.modbus.map_or(WordOrder::Abcd, |modbus| modbus.word_order.into())
+        self.modbus.map_or(WordOrder::Abcd, RawModbus::word_order)
     }
 
     fn all(&self) -> [(&'static str, bool); 7] {
