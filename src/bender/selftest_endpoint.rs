@@ -4,6 +4,7 @@ use std::io::{self, ErrorKind};
 use std::path::Path;
 
 use tokio::net::{TcpStream, lookup_host};
+use tokio::task::spawn_blocking;
 use tokio::time::{Instant, timeout};
 
 use super::can::Socket;
@@ -24,7 +25,7 @@ pub async fn check(profile: &Profile, endpoint: &str) -> Step {
             Transport::ModbusRtu(.., settings) | Transport::SerialTable(.., settings) => {
                 port(endpoint, settings)
             }
-            Transport::Folder(_) => folder(endpoint),
+            Transport::Folder(_) => apart(folder, endpoint).await,
             Transport::Can(can) => interface(endpoint, can.fd),
             Transport::Canopen(_) => interface(endpoint, false),
         }
@@ -32,7 +33,13 @@ pub async fn check(profile: &Profile, endpoint: &str) -> Step {
     match timeout(limit, opening).await {
         Err(_) => {
             let found = format!("{endpoint}: no answer within {} ms", limit.as_millis());
-            Step::failed(STEP, found, unreachable(endpoint))
+            let advice = match &profile.transport {
+                Transport::Folder(_) => {
+                    "the share hangs: is its server on, is the network cable in; `mount` lists what is mounted".to_owned()
+                }
+                _ => unreachable(endpoint),
+            };
+            Step::failed(STEP, found, advice)
         }
         Ok(Err((found, advice))) => Step::failed(STEP, format!("{endpoint}: {found}"), advice),
         Ok(Ok(what)) => {
@@ -170,6 +177,15 @@ fn holders(path: &Path) -> Vec<String> {
     found
 }
 
+/// Off the async thread: a share may hang, and the time for it must go on.
+async fn apart(look: impl FnOnce(&str) -> Opened + Send + 'static, path: &str) -> Opened {
+    let path = path.to_owned();
+    match spawn_blocking(move || look(&path)).await {
+        Ok(opened) => opened,
+        Err(join) => std::panic::resume_unwind(join.into_panic()),
+    }
+}
+
 fn folder(path: &str) -> Opened {
     if !Path::new(path).is_dir() {
         let advice = "mount the share that the controller writes to (`mount` lists what is mounted), or correct `endpoint`";
@@ -184,5 +200,23 @@ fn folder(path: &str) -> Opened {
                           uid and gid)";
             Err((format!("cannot be written to: {error}"), advice.into()))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The look was taken on the async thread, so that no deadline ended it.
+    #[tokio::test]
+    async fn a_share_that_hangs_is_waited_for_and_no_longer() {
+        let (release, held) = std::sync::mpsc::channel::<()>();
+        let look = move |_: &str| -> Opened {
+            let _ = held.recv();
+            Ok("found")
+        };
+        let limit = std::time::Duration::from_millis(20);
+        assert!(timeout(limit, apart(look, "share")).await.is_err());
+        drop(release);
     }
 }
