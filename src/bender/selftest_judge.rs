@@ -107,9 +107,8 @@ pub fn no_answer(profile: &Profile, endpoint: &str, error: &LinkError, guess: Op
         )),
         transport if transport.serial().is_some() => step.advice.extend(line_advice(transport)),
         Transport::Folder(number) => step.advice.push(format!(
-            "no answer file bender{number}.ans came in {endpoint}: does the controller look at this folder (its name for the \
-             share may be another), is unit_id = {number} its number, does its program run, does its clock agree with the share's \
-             (it carries out no command that looks old)"
+            "does the controller look at {endpoint} (its name for the share may be another), is unit_id = {number} its number, does \
+             its program run; do the clocks of controller, share and this computer agree (a file that looks old is not used)"
         )),
         Transport::Can(_) => step.advice.push(format!(
             "no status came on {endpoint}: is the controller on, is its bit rate the interface's (`ip -details link show \

@@ -169,3 +169,21 @@ pub fn main() -> ExitCode {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A read at a share that hung kept `push`, `selftest` and the daemon for ever, after all was said.
+    #[test]
+    fn a_thread_that_hangs_does_not_keep_the_program_from_ending() {
+        let (release, held) = std::sync::mpsc::channel::<()>();
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let work = async move {
+            tokio::task::spawn_blocking(move || held.recv());
+            7
+        };
+        assert_eq!(run_on(runtime, work), 7);
+        drop(release);
+    }
+}
