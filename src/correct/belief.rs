@@ -19,6 +19,11 @@ impl Belief {
         Belief { mean, covariance: DMatrix::from_diagonal(&variances) }
     }
 
+    /// Lets all unknowns move together along a direction, by so many of it (one sigma).
+    pub fn loosen_along(&mut self, direction: &DVector<f64>, sigma: f64) {
+        self.covariance += direction * direction.transpose() * (sigma * sigma);
+    }
+
     /// Number of unknowns.
     pub fn len(&self) -> usize {
         self.mean.len()
@@ -33,6 +38,40 @@ impl Belief {
     pub fn predict(&self, row: &DVector<f64>) -> Known {
         let variance = (&self.covariance * row).dot(row);
         Known { value: self.mean.dot(row), sigma: variance.max(0.0).sqrt() }
+    }
+
+    /// For each measurement what the belief and all others let expect of it, with the sigma of finding another: its own noise
+    /// included. (The inverse of the whole covariance gives both at once.)
+    pub fn leave_one_out(&self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) -> Vec<Known> {
+        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
+        let innovation = DVector::from_column_slice(values) - &h * &self.mean;
+        let spread = &h * &self.covariance * h.transpose() + noise;
+        let Some(inverse) = spread.cholesky().map(|factor| factor.inverse()) else {
+            return values.iter().map(|&value| Known { value, sigma: f64::INFINITY }).collect();
+        };
+        let weighed = &inverse * innovation;
+        let one = |(i, value): (usize, &f64)| Known {
+            value: value - weighed[i] / inverse[(i, i)],
+            sigma: inverse[(i, i)].sqrt().recip(),
+        };
+        values.iter().enumerate().map(one).collect()
+    }
+
+    /// By which factor of these all measurements are off together, with the sigma that it would have by chance.
+    pub fn common_factor(
+        &self,
+        rows: &[DVector<f64>],
+        per_factor: &[f64],
+        values: &[f64],
+        noise: &DMatrix<f64>,
+    ) -> Option<Known> {
+        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
+        let innovation = DVector::from_column_slice(values) - &h * &self.mean;
+        let per_factor = DVector::from_column_slice(per_factor);
+        let solved = (&h * &self.covariance * h.transpose() + noise).cholesky()?.solve(&per_factor);
+        let weight = solved.dot(&per_factor);
+        (weight > 0.0)
+            .then(|| Known { value: solved.dot(&innovation) / weight, sigma: weight.sqrt().recip() })
     }
 
     /// Takes measurements in: one row, value each, and the noise's covariance. A noise that leaves nothing to

@@ -14,17 +14,27 @@ use crate::tube::{Material, Nominal};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
-/// Prior of x and its sigma (field: .3 .4 .3, each to a quarter).
+/// Prior of x (field: .3 .4 .3). All of it is known to a half: materials, dies and lubrication differ, mostly upwards, and what is
+/// beyond three sigmas would be cut by the step limit.
 const SHAPE: [f64; 3] = [0.3, 0.4, 0.3];
-const SHAPE_SIGMA: f64 = 0.25;
+const SCALE_SIGMA: f64 = 0.45;
+/// How much of a 90 degree bend's is fixed, how much in proportion to the angle.
+const MIX: [f64; 3] = [1.0, -1.0, 0.0];
+const MIX_SIGMA: f64 = 0.15;
+/// And what each is off besides.
+const SHAPE_SIGMA: f64 = 0.1;
 /// Prior sigma of a bend's residual.
-const RESIDUAL_SIGMA_RAD: f64 = 0.15 * DEGREE;
+const RESIDUAL_SIGMA_RAD: f64 = 0.10 * DEGREE;
 /// Scatter from bend to bend that no table can take out.
 const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
 /// Scatter from tube to tube, common to its bends, as a share of the spring-back.
 const TUBE_SCATTER: f64 = 0.015;
-/// Drift of x from part to part: without it the filter stays stuck after a change of material.
-const DRIFT: f64 = 0.02;
+/// Drift of all of x together from part to part: without it the filter stays stuck after a change of material.
+const DRIFT: f64 = 0.01;
+/// A change of all bends together that is more than drift: the sum of what each part was off, in sigmas and less by this each time
+/// (E. S. Page's cumulative sum, 1954), up to that. Then all of x is open again.
+const CHANGE_LESS: f64 = 0.5;
+const CHANGE: f64 = 3.0;
 /// Common scale of another job's spring-back: of the same batch, of another or an unknown one.
 const SAME_BATCH: f64 = 0.02;
 const OTHER_BATCH: f64 = 0.10;
@@ -42,6 +52,10 @@ pub struct Springback {
     suspect: Vec<bool>,
     /// Sigma of each bend's innovation when the last part came in.
     surprise_sigma_rad: Vec<f64>,
+    /// Whether a part of this job was learned from.
+    has_learned: bool,
+    /// Sums of how far all bends together were off, upwards and downwards.
+    changed: [f64; 2],
 }
 
 /// A measured angle that does not fit what the job showed before.
@@ -55,6 +69,13 @@ pub struct Outlier {
     pub expected_rad: Known,
 }
 
+impl Outlier {
+    /// How far off, in sigmas.
+    fn off(&self) -> f64 {
+        (self.found_rad - self.expected_rad.value).abs() / self.expected_rad.sigma
+    }
+}
+
 impl Springback {
     /// What is believed before the job's first part. `batch` tells whose tubes the records are.
     pub fn prior(nominal: &Nominal, records: &[&JobRecord], batch: Option<&str>) -> Springback {
@@ -62,11 +83,19 @@ impl Springback {
         let s90_rad = nominal.lra.bends.iter().map(|b| usual_springback(nominal, b.radius_mm)).collect();
         let mut unknowns: Vec<Known> = SHAPE.map(|value| Known { value, sigma: SHAPE_SIGMA }).to_vec();
         unknowns.extend(vec![Known { value: 0.0, sigma: RESIDUAL_SIGMA_RAD }; n]);
+        let mut belief = Belief::new(&unknowns);
+        for (along, sigma) in [(SHAPE, SCALE_SIGMA), (MIX, MIX_SIGMA)] {
+            let mut direction = DVector::zeros(unknowns.len());
+            direction.rows_mut(0, 3).copy_from_slice(&along);
+            belief.loosen_along(&direction, sigma);
+        }
         let mut out = Springback {
-            belief: Belief::new(&unknowns),
+            belief,
             s90_rad,
             suspect: vec![false; n],
             surprise_sigma_rad: vec![0.0; n],
+            has_learned: false,
+            changed: [0.0; 2],
         };
         for record in records {
             let same = batch.is_some() && record.batch.as_deref() == batch;
@@ -91,36 +120,101 @@ impl Springback {
     }
 
     /// Takes in one part: commanded and measured angle per bend. Answers with what was rejected.
+    ///
+    /// Each bend is held against what the others of the same tube say (leave-one-out): that all spring back alike by more than was
+    /// expected is news, that one does so alone is doubtful.
     pub fn learn(&mut self, commanded_rad: &[f64], measured: &[Known]) -> Vec<Outlier> {
-        (0..SHAPE.len()).for_each(|k| self.belief.loosen(k, DRIFT));
-        let (mut rows, mut values, mut variances) = (Vec::new(), Vec::new(), Vec::new());
-        let mut outliers = Vec::new();
-        for (i, (c, m)) in commanded_rad.iter().zip(measured).enumerate() {
-            let expected_rad = self.measured_at(i, *c, m.sigma);
-            let found_rad = c - m.value;
-            let off = (found_rad - expected_rad.value).abs() / expected_rad.sigma;
-            self.surprise_sigma_rad[i] = expected_rad.sigma;
-            let mut variance = BEND_SCATTER_RAD.powi(2) + m.sigma.powi(2);
-            if off > REJECT && !self.suspect[i] {
-                self.suspect[i] = true;
-                outliers.push(Outlier { bend: i, found_rad, expected_rad });
-                continue;
-            }
-            if off > REJECT {
-                // Twice in a row is no outlier: this bend has changed.
-                self.belief.loosen(SHAPE.len() + i, found_rad - expected_rad.value);
-            } else if off > DOUBT {
-                variance += expected_rad.sigma.powi(2) * ((off / DOUBT).powi(2) - 1.0);
-            }
-            self.suspect[i] = off > REJECT;
-            rows.push(self.row(i, *c));
-            values.push(found_rad);
-            variances.push(variance);
+        self.belief.loosen_along(&self.along(SHAPE), DRIFT);
+        let found: Vec<f64> = commanded_rad.iter().zip(measured).map(|(c, m)| c - m.value).collect();
+        let mut variances: Vec<f64> =
+            measured.iter().map(|m| BEND_SCATTER_RAD.powi(2) + m.sigma.powi(2)).collect();
+        let rows: Vec<DVector<f64>> =
+            commanded_rad.iter().enumerate().map(|(i, c)| self.row(i, *c)).collect();
+        for (i, m) in measured.iter().enumerate() {
+            self.surprise_sigma_rad[i] = self.measured_at(i, commanded_rad[i], m.sigma).sigma;
         }
-        let mut noise = common_noise(&values, TUBE_SCATTER);
-        variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
-        self.belief.update(&rows, &values, &noise);
+        let (mut heard, mut outliers): (Vec<usize>, Vec<Outlier>) = ((0..found.len()).collect(), Vec::new());
+        let before = std::mem::replace(&mut self.suspect, vec![false; found.len()]);
+        // One after the other, the worst first: it spoils what the others are held against.
+        while let Some(odd) = self.oddest(&heard, &rows, &found, &variances) {
+            let i = odd.bend;
+            self.suspect[i] = true;
+            heard.retain(|k| *k != i);
+            if before[i] {
+                // Twice in a row is no outlier: this bend has changed.
+                self.belief.loosen(SHAPE.len() + i, odd.found_rad - odd.expected_rad.value);
+            } else {
+                outliers.push(odd);
+            }
+        }
+        for expected in self.others_say(&heard, &rows, &found, &variances) {
+            let off = expected.off() / DOUBT;
+            if off > 1.0 {
+                variances[expected.bend] += expected.expected_rad.sigma.powi(2) * (off.powi(2) - 1.0);
+            }
+        }
+        self.notice_change(&heard, &rows, &found, &variances);
+        heard.extend((0..found.len()).filter(|&i| self.suspect[i] && before[i]));
+        let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
+        let (values, kept) = (pick(&found), heard.iter().map(|&i| rows[i].clone()).collect::<Vec<_>>());
+        self.belief.update(&kept, &values, &noise(&values, &pick(&variances)));
         outliers
+    }
+
+    /// Whether all bends together spring back by another factor than they did.
+    fn notice_change(&mut self, heard: &[usize], rows: &[DVector<f64>], found: &[f64], variances: &[f64]) {
+        let usual = self.along(SHAPE);
+        let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
+        let (values, kept) = (pick(found), heard.iter().map(|&i| rows[i].clone()).collect::<Vec<_>>());
+        let per_factor: Vec<f64> = kept.iter().map(|row| row.dot(&usual)).collect();
+        let noise = noise(&values, &pick(variances));
+        let Some(factor) = self.belief.common_factor(&kept, &per_factor, &values, &noise) else { return };
+        let off = factor.value / factor.sigma;
+        // What nothing was known of before cannot have changed.
+        if std::mem::replace(&mut self.has_learned, true) {
+            let sum = |before: f64, off: f64| (before + off - CHANGE_LESS).max(0.0);
+            self.changed = [sum(self.changed[0], off), sum(self.changed[1], -off)];
+        }
+        if self.changed.iter().any(|sum| *sum > CHANGE) {
+            self.belief.loosen_along(&usual, factor.value.abs());
+            self.changed = [0.0; 2];
+        }
+    }
+
+    /// A direction of x among all unknowns.
+    fn along(&self, shape: [f64; 3]) -> DVector<f64> {
+        let mut direction = DVector::zeros(self.belief.len());
+        direction.rows_mut(0, SHAPE.len()).copy_from_slice(&shape);
+        direction
+    }
+
+    /// The bend that fits worst to what the others say, if it does not fit at all.
+    fn oddest(
+        &self,
+        heard: &[usize],
+        rows: &[DVector<f64>],
+        found: &[f64],
+        variances: &[f64],
+    ) -> Option<Outlier> {
+        let all = self.others_say(heard, rows, found, variances);
+        all.into_iter().filter(|o| o.off() > REJECT).max_by(|a, b| a.off().total_cmp(&b.off()))
+    }
+
+    /// For each of these bends what the others let expect, and what was found.
+    fn others_say(
+        &self,
+        heard: &[usize],
+        rows: &[DVector<f64>],
+        found: &[f64],
+        variances: &[f64],
+    ) -> Vec<Outlier> {
+        let values: Vec<f64> = heard.iter().map(|&i| found[i]).collect();
+        let own: Vec<f64> = heard.iter().map(|&i| variances[i]).collect();
+        let picked: Vec<DVector<f64>> = heard.iter().map(|&i| rows[i].clone()).collect();
+        let left_out = self.belief.leave_one_out(&picked, &values, &noise(&values, &own));
+        let one =
+            |(&i, expected_rad): (&usize, Known)| Outlier { bend: i, found_rad: found[i], expected_rad };
+        heard.iter().zip(left_out).map(one).collect()
     }
 
     /// Spring-back of a bend at a commanded angle, never negative, with the sigma of the estimate.
@@ -177,6 +271,13 @@ impl Springback {
         row.rows_mut(0, 3).copy_from_slice(&[s90_rad, s90_rad * share, s90_rad * share.sqrt()]);
         row
     }
+}
+
+/// Of a tube's bends: each its own, and what they have in common.
+fn noise(values: &[f64], variances: &[f64]) -> DMatrix<f64> {
+    let mut noise = common_noise(values, TUBE_SCATTER);
+    variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
+    noise
 }
 
 fn common_noise(values: &[f64], share: f64) -> DMatrix<f64> {

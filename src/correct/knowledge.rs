@@ -5,9 +5,13 @@
 use serde::{Deserialize, Serialize};
 
 use super::history::{History, SetUp};
-use super::lengths::{Sides, grown};
+use super::lengths::{Side, grown};
 use super::replay::Used;
+use super::rotations::{TurnPoint, turned};
 use crate::tube::{Nominal, deg};
+
+/// Of the form that is read and written.
+pub const VERSION: u32 = 2;
 
 /// Jobs kept per key; the oldest go first.
 const MAX_JOBS: usize = 200;
@@ -16,7 +20,7 @@ const MAX_JOBS: usize = 200;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Knowledge {
-    /// Version of the form; this program reads and writes 1.
+    /// Version of the form; this program reads and writes [`VERSION`].
     pub version: u32,
     /// One record per key.
     pub keys: Vec<KeyRecord>,
@@ -24,7 +28,7 @@ pub struct Knowledge {
 
 impl Default for Knowledge {
     fn default() -> Knowledge {
-        Knowledge { version: 1, keys: Vec::new() }
+        Knowledge { version: VERSION, keys: Vec::new() }
     }
 }
 
@@ -72,6 +76,8 @@ pub struct JobRecord {
     pub bends: Vec<BendPoint>,
     /// One point per fed straight.
     pub straights: Vec<StraightPoint>,
+    /// One point per turn that was known well.
+    pub turns: Vec<TurnPoint>,
 }
 
 /// Spring-back of one bend.
@@ -92,11 +98,11 @@ pub struct BendPoint {
 }
 
 /// Growth of one straight between its corners.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StraightPoint {
-    /// What the bends at its sides bring.
-    pub sides: Sides,
+    /// The bends at its sides whose corners count.
+    pub sides: Vec<Side>,
     /// Distance measured less length fed and the die's tangent lengths.
     pub growth_mm: f64,
     /// Sigma of that mean.
@@ -144,25 +150,16 @@ impl Knowledge {
 pub fn record(nominal: &Nominal, history: &History, used: &[Used]) -> Option<JobRecord> {
     let id = history.job_id(nominal).filter(|_| !used.is_empty())?;
     let bend = |i: usize| {
-        let mut mean = Mean::default();
+        let mut mean = Mean::<2>::default();
         for u in used.iter().filter(|u| !u.outliers.contains(&i)) {
             let (c, m) = (u.commanded.bends[i].angle_rad, &u.measured.bends[i]);
-            mean.add([c, c - m.angle_rad, 0.0], m.angle_sigma_rad.hypot(BEND_SCATTER_RAD));
+            mean.add([c, c - m.angle_rad], m.angle_sigma_rad.hypot(BEND_SCATTER_RAD));
         }
         let (values, sigma_rad) = mean.finish()?;
         let radius_mm = nominal.lra.bends[i].radius_mm;
         Some(BendPoint { commanded_rad: values[0], radius_mm, springback_rad: values[1], sigma_rad })
     };
-    let straight = |j: usize| {
-        let mut mean = Mean::default();
-        for u in used {
-            for g in grown(&nominal.lra, &u.commanded, &u.measured).iter().filter(|g| g.straight == j) {
-                mean.add([g.sides.plain_mm, g.sides.sprung_mm, g.growth_mm], g.sigma_mm);
-            }
-        }
-        let ([plain_mm, sprung_mm, growth_mm], sigma_mm) = mean.finish()?;
-        Some(StraightPoint { sides: Sides { plain_mm, sprung_mm }, growth_mm, sigma_mm })
-    };
+    let straight = |j: usize| straight_point(nominal, used, j);
     let n = nominal.lra.bends.len();
     Some(JobRecord {
         id,
@@ -171,27 +168,70 @@ pub fn record(nominal: &Nominal, history: &History, used: &[Used]) -> Option<Job
         parts: used.len(),
         bends: (0..n).filter_map(bend).collect(),
         straights: (0..n).filter_map(straight).collect(),
+        turns: (1..n).filter_map(|i| turn_point(nominal, used, i)).collect(),
     })
+}
+
+/// The mean over the tubes in which it was measured between the same corners.
+fn straight_point(nominal: &Nominal, used: &[Used], straight: usize) -> Option<StraightPoint> {
+    let all = used.iter().flat_map(|u| grown(&nominal.lra, &u.commanded, &u.measured));
+    let of_it: Vec<_> = all.filter(|g| g.straight == straight).collect();
+    let corners = of_it.last()?.sides.len();
+    let mut mean = Mean::<5>::default();
+    for g in of_it.iter().filter(|g| g.sides.len() == corners) {
+        let mut values = [g.growth_mm, 0.0, 0.0, 0.0, 0.0];
+        for (k, side) in g.sides.iter().enumerate() {
+            (values[1 + 2 * k], values[2 + 2 * k]) = (side.commanded_rad, side.formed_rad);
+        }
+        mean.add(values, g.sigma_mm);
+    }
+    let (values, sigma_mm) = mean.finish()?;
+    let side = |(k, side): (usize, &Side)| Side {
+        commanded_rad: values[1 + 2 * k],
+        formed_rad: values[2 + 2 * k],
+        ..*side
+    };
+    let sides = of_it.last()?.sides.iter().enumerate().map(side).collect();
+    Some(StraightPoint { sides, growth_mm: values[0], sigma_mm })
+}
+
+/// The mean over the tubes that were turned the same way.
+fn turn_point(nominal: &Nominal, used: &[Used], bend: usize) -> Option<TurnPoint> {
+    let tolerance_rad = nominal.tolerance.rotation_rad;
+    let all = used.iter().flat_map(|u| turned(&u.commanded, &u.measured, tolerance_rad));
+    let of_it: Vec<TurnPoint> = all.filter(|(i, _)| *i == bend).map(|(_, point)| point).collect();
+    let per_backlash = of_it.last()?.per_backlash;
+    let mut mean = Mean::<1>::default();
+    for point in of_it.iter().filter(|point| point.per_backlash == per_backlash) {
+        mean.add([point.off_rad], point.sigma_rad);
+    }
+    let ([off_rad], sigma_rad) = mean.finish()?;
+    Some(TurnPoint { per_backlash, off_rad, sigma_rad })
 }
 
 /// Scatter of the single bend around its mean, for weighing.
 const BEND_SCATTER_RAD: f64 = 0.08 * std::f64::consts::PI / 180.0;
 
-/// Mean of three values with common weights 1 / sigma^2.
-#[derive(Default)]
-struct Mean {
+/// Mean of some values with common weights 1 / sigma^2.
+struct Mean<const N: usize> {
     weight: f64,
-    sum: [f64; 3],
+    sum: [f64; N],
 }
 
-impl Mean {
-    fn add(&mut self, values: [f64; 3], sigma: f64) {
+impl<const N: usize> Default for Mean<N> {
+    fn default() -> Mean<N> {
+        Mean { weight: 0.0, sum: [0.0; N] }
+    }
+}
+
+impl<const N: usize> Mean<N> {
+    fn add(&mut self, values: [f64; N], sigma: f64) {
         let weight = 1.0 / sigma.powi(2);
         self.weight += weight;
         self.sum.iter_mut().zip(values).for_each(|(s, v)| *s += weight * v);
     }
 
-    fn finish(self) -> Option<([f64; 3], f64)> {
+    fn finish(self) -> Option<([f64; N], f64)> {
         (self.weight > 0.0).then(|| (self.sum.map(|s| s / self.weight), self.weight.sqrt().recip()))
     }
 }

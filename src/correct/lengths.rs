@@ -1,29 +1,29 @@
-//! How much to feed: distances of corners with the angle error taken out first, and turns of the plane.
+//! How much to feed: distances of corners with the angle error taken out first.
 //!
-//! A bend pushes the corners at its two sides away from the fed length by its tangent length, and that grows
-//! beyond the die's, since the arc opens when the tube springs back: D - L = sum of T (1 + g + k s/A) + q, with T
-//! the die radius' tangent length at the *measured* angle (so an angle error is no feed error), s/A the bend's
-//! spring-back over its angle, k and g common to the key, q the straight's own residual. Beside a bend of 150
-//! degrees or more, whose corner runs away, the straight is measured from its tangent point. The straight after
-//! the last bend is what the cut length leaves.
+//! A bend pushes the corners at its two sides away from the fed length by its tangent length T, and that grows beyond the
+//! die's when the tube springs back: a share a of the spring-back s opens the arc, whose length R c stays, from the die's
+//! radius R to R c / (c - a s), c the commanded angle; the rest straightens both its ends by R (1 - a) s / 2 each. So
+//! D - L = sum of T (1 + g) + what opens and straightens at a + q, at the *measured* angles (an angle error is no feed
+//! error), with a and g common to the key, q the straight's own. Beside a bend of 150 degrees or more, whose corner
+//! runs away, the straight is measured from its tangent point. The straight after the last bend is what the cut length
+//! leaves. Linear in a about its usual value; the field notes give the lengths, the geometry is elementary.
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::belief::Belief;
 use super::knowledge::JobRecord;
-use crate::inspect::{Known, corners, distances, rotation};
-use crate::tube::{CommandTable, Lra, MeasuredTube, wrap_angle};
+use crate::inspect::{Known, corners, distances};
+use crate::tube::{CommandTable, Lra, MeasuredTube, deg};
 
-const DEGREE: f64 = std::f64::consts::PI / 180.0;
-
-/// Prior of k: all spring-back opens the arc (1) or a part only straightens its ends (less).
-const GROWTH: Known = Known { value: 0.9, sigma: 0.2 };
+/// Usual share of the spring-back that opens the arc, and what is believed of the key's about it.
+const USUAL_SHARE: f64 = 0.65;
+const SHARE: Known = Known { value: 0.0, sigma: 0.15 };
 /// Prior of g, what the arc grows without spring-back.
-const CONSTANT_GROWTH: Known = Known { value: 0.0, sigma: 0.01 };
+const CONSTANT_GROWTH: Known = Known { value: 0.0, sigma: 0.002 };
 /// Prior of a straight's residual, its drift per part, and the feed's own scatter.
-const RESIDUAL_SIGMA_MM: f64 = 0.3;
-const DRIFT_MM: f64 = 0.02;
+const RESIDUAL_SIGMA_MM: f64 = 0.08;
+const DRIFT_MM: f64 = 0.01;
 const FEED_SCATTER_MM: f64 = 0.1;
 /// Beyond this many sigmas a length counts less: slip is scatter, not a feed error.
 const DOUBT: f64 = 3.0;
@@ -38,26 +38,51 @@ pub struct Lengths {
     slipped_mm: Vec<f64>,
 }
 
-/// What the bends at the sides of a straight add to it: tangent lengths of the die radius, and these times s/A.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+/// A bend at one side of a straight, whose corner counts.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Sides {
-    /// Sum of T.
-    pub plain_mm: f64,
-    /// Sum of T s/A.
-    pub sprung_mm: f64,
+pub struct Side {
+    /// The die's radius.
+    pub radius_mm: f64,
+    /// Commanded angle.
+    #[serde(rename = "commanded_deg", with = "deg")]
+    pub commanded_rad: f64,
+    /// Formed angle.
+    #[serde(rename = "formed_deg", with = "deg")]
+    pub formed_rad: f64,
+}
+
+impl Side {
+    /// T on the die's radius.
+    fn tangent_mm(&self) -> f64 {
+        self.radius_mm * (self.formed_rad / 2.0).tan()
+    }
+
+    /// What opening and straightening add at this share.
+    fn sprung_mm(&self, share: f64) -> f64 {
+        let springback = (self.commanded_rad - self.formed_rad).clamp(0.0, 0.5 * self.commanded_rad);
+        let opened_mm = self.radius_mm * self.commanded_rad / (self.commanded_rad - share * springback);
+        self.tangent_mm() * (opened_mm / self.radius_mm - 1.0) + opened_mm * (1.0 - share) * springback / 2.0
+    }
+
+    /// The same by how much more per share.
+    fn per_share_mm(&self) -> f64 {
+        const STEP: f64 = 0.1;
+        (self.sprung_mm(USUAL_SHARE + STEP) - self.sprung_mm(USUAL_SHARE - STEP)) / (2.0 * STEP)
+    }
 }
 
 impl Lengths {
     /// What is believed before the job's first part.
     pub fn prior(wanted: &Lra, records: &[&JobRecord]) -> Lengths {
-        let mut unknowns = vec![GROWTH, CONSTANT_GROWTH];
+        let mut unknowns = vec![SHARE, CONSTANT_GROWTH];
         unknowns.extend(vec![Known { value: 0.0, sigma: RESIDUAL_SIGMA_MM }; wanted.bends.len()]);
         let mut belief = Belief::new(&unknowns);
         for point in records.iter().flat_map(|r| &r.straights) {
             let row = growth_row(belief.len(), &point.sides);
             let variance = point.sigma_mm.powi(2) + RESIDUAL_SIGMA_MM.powi(2);
-            belief.update(&[row], &[point.growth_mm], &DMatrix::from_element(1, 1, variance));
+            let value = point.growth_mm - usual_mm(&point.sides);
+            belief.update(&[row], &[value], &DMatrix::from_element(1, 1, variance));
         }
         Lengths {
             belief,
@@ -75,7 +100,8 @@ impl Lengths {
             let mut variance = found.sigma_mm.powi(2);
             let expected = self.belief.predict(&row);
             let sigma = expected.sigma.hypot(found.sigma_mm);
-            let off_mm = found.growth_mm - expected.value;
+            let value = found.growth_mm - usual_mm(&found.sides);
+            let off_mm = value - expected.value;
             let before_mm = std::mem::take(&mut self.slipped_mm[found.straight]);
             self.surprise_sigma_mm[found.straight] = sigma;
             if off_mm.abs() > DOUBT * sigma {
@@ -87,7 +113,7 @@ impl Lengths {
                     self.slipped_mm[found.straight] = off_mm;
                 }
             }
-            self.belief.update(&[row], &[found.growth_mm], &DMatrix::from_element(1, 1, variance));
+            self.belief.update(&[row], &[value], &DMatrix::from_element(1, 1, variance));
         }
     }
 
@@ -97,7 +123,8 @@ impl Lengths {
         let sides = sides(&self.wanted, straight, commanded_rad, formed_rad, |i| {
             self.wanted.bends[i].angle_rad < MeasuredTube::INTERSECTION_LIMIT_RAD
         });
-        self.belief.predict(&self.row(straight, &sides))
+        let more = self.belief.predict(&self.row(straight, &sides));
+        Known { value: more.value + usual_mm(&sides), sigma: more.sigma }
     }
 
     /// The feed that gives the wanted straight when the bends come out right; may be negative.
@@ -116,18 +143,23 @@ impl Lengths {
         self.slipped_mm.iter().copied().enumerate().filter(|(_, mm)| *mm != 0.0)
     }
 
-    fn row(&self, straight: usize, sides: &Sides) -> DVector<f64> {
+    fn row(&self, straight: usize, sides: &[Side]) -> DVector<f64> {
         let mut row = growth_row(self.belief.len(), sides);
         row[2 + straight] = 1.0;
         row
     }
 }
 
-fn growth_row(len: usize, sides: &Sides) -> DVector<f64> {
+fn growth_row(len: usize, sides: &[Side]) -> DVector<f64> {
     let mut row = DVector::zeros(len);
-    row[0] = sides.sprung_mm;
-    row[1] = sides.plain_mm;
+    row[0] = sides.iter().map(Side::per_share_mm).sum();
+    row[1] = sides.iter().map(Side::tangent_mm).sum();
     row
+}
+
+/// What the sides add at the usual share, beyond the die's tangent lengths.
+fn usual_mm(sides: &[Side]) -> f64 {
+    sides.iter().map(|side| side.sprung_mm(USUAL_SHARE)).sum()
 }
 
 fn sides(
@@ -136,26 +168,24 @@ fn sides(
     commanded: &[f64],
     formed: &[f64],
     corner: impl Fn(usize) -> bool,
-) -> Sides {
-    let mut out = Sides::default();
+) -> Vec<Side> {
     let last = wanted.bends.len();
-    for i in [straight.checked_sub(1), (straight < last).then_some(straight)].into_iter().flatten() {
-        if corner(i) && formed[i] > 0.0 {
-            let tangent = wanted.bends[i].radius_mm * (formed[i] / 2.0).tan();
-            out.plain_mm += tangent;
-            out.sprung_mm += tangent * (commanded[i] - formed[i]).max(0.0) / formed[i];
-        }
-    }
-    out
+    let both = [straight.checked_sub(1), (straight < last).then_some(straight)].into_iter().flatten();
+    let side = |i: usize| Side {
+        radius_mm: wanted.bends[i].radius_mm,
+        commanded_rad: commanded[i].max(formed[i]),
+        formed_rad: formed[i],
+    };
+    both.filter(|&i| corner(i) && formed[i] > 0.0).map(side).collect()
 }
 
 /// One straight of one part: by how much it came out longer than fed.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Grown {
     /// Straight, from 0.
     pub straight: usize,
     /// Its sides.
-    pub sides: Sides,
+    pub sides: Vec<Side>,
     /// Measured distance less the fed length and the die's tangent lengths.
     pub growth_mm: f64,
     /// Sigma of the measurement and the feed.
@@ -170,45 +200,10 @@ pub fn grown(wanted: &Lra, commanded: &CommandTable, measured: &MeasuredTube) ->
     let one = |(straight, found): (usize, Option<Known>)| {
         let found = found?;
         let sides = sides(wanted, straight, &angles, &formed, |i| corner[i]);
-        let growth_mm = found.value - commanded.bends[straight].length_mm - sides.plain_mm;
+        let tangents_mm: f64 = sides.iter().map(Side::tangent_mm).sum();
+        let growth_mm = found.value - commanded.bends[straight].length_mm - tangents_mm;
         Some(Grown { straight, sides, growth_mm, sigma_mm: found.sigma.hypot(FEED_SCATTER_MM) })
     };
     let fed = distances(measured, &corner).into_iter().take(wanted.bends.len());
     fed.enumerate().filter_map(one).collect()
-}
-
-/// By how much each bend's plane comes out off the commanded turn: backlash, a worn clamp. One offset per bend.
-#[derive(Debug, Clone)]
-pub struct Rotations {
-    offset: Vec<Known>,
-}
-
-/// Prior of an offset, and the scatter of the axis.
-const OFFSET: Known = Known { value: 0.0, sigma: 0.2 * DEGREE };
-const AXIS_SCATTER_RAD: f64 = 0.1 * DEGREE;
-
-impl Rotations {
-    /// Nothing known.
-    pub fn prior(bends: usize) -> Rotations {
-        Rotations { offset: vec![OFFSET; bends] }
-    }
-
-    /// Takes in one part; a rotation known worse than half its tolerance says nothing.
-    pub fn learn(&mut self, commanded: &CommandTable, measured: &MeasuredTube, tolerance_rad: f64) {
-        for (i, offset) in self.offset.iter_mut().enumerate() {
-            let Some(found) = rotation(measured, i).filter(|r| r.sigma <= tolerance_rad / 2.0) else {
-                continue;
-            };
-            let innovation = wrap_angle(found.value - commanded.bends[i].rotation_rad) - offset.value;
-            let noise = found.sigma.powi(2) + AXIS_SCATTER_RAD.powi(2);
-            let prior = offset.sigma.powi(2);
-            offset.value += innovation * prior / (prior + noise);
-            offset.sigma = (prior * noise / (prior + noise)).sqrt();
-        }
-    }
-
-    /// The turn to command for a wanted one; the first row has no plane to turn against.
-    pub fn command_for(&self, bend: usize, wanted_rad: f64) -> f64 {
-        if bend == 0 { wanted_rad } else { wanted_rad - self.offset[bend].value }
-    }
 }

@@ -2,7 +2,7 @@
 //!
 //! Between `inspect` and `bender`. [`step`] is pure: history and knowledge in, one [`Answer`] out, nothing kept.
 //! The way through: [`history`] (the contract) -> [`replay`] (turn each scan round, learn from it: [`estimate`]
-//! angles, [`lengths`] feeds and planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
+//! angles, [`lengths`] feeds, [`rotations`] planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
 //! limits) -> [`verdict`].
 
 mod belief;
@@ -12,6 +12,7 @@ pub mod knowledge;
 pub mod lengths;
 pub mod plan;
 pub mod replay;
+pub mod rotations;
 mod rows;
 pub mod store;
 pub mod verdict;

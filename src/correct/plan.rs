@@ -82,11 +82,20 @@ pub fn first(model: &Model, nominal: &Nominal) -> CommandTable {
 
 /// The next table after `newest`, and what changes and why. The table in force itself when nothing does.
 pub fn next(model: &Model, nominal: &Nominal, newest: &Used, limits: &Limits) -> (CommandTable, Vec<Reason>) {
-    let mut plan =
-        Plan { model, nominal, newest, limits, table: newest.commanded.clone(), reasons: Vec::new() };
-    (0..nominal.lra.bends.len()).for_each(|i| plan.angle(i));
-    (0..nominal.lra.bends.len()).for_each(|i| plan.rotation(i));
-    plan.lengths();
+    let begin = |settled| Plan {
+        model,
+        nominal,
+        newest,
+        limits,
+        settled,
+        table: newest.commanded.clone(),
+        reasons: Vec::new(),
+    };
+    // Noise is not chased; but once something has to be moved, the best is made of everything.
+    let mut plan = begin(true).planned();
+    if plan.table != newest.commanded {
+        plan = begin(false).planned();
+    }
     for (i, off_mm) in model.lengths.slips() {
         let text = format!(
             "feed {}: {off_mm:+.2} mm off what was expected: mostly slip of a worn clamp; not chased unless it stays",
@@ -102,18 +111,37 @@ struct Plan<'a> {
     nominal: &'a Nominal,
     newest: &'a Used,
     limits: &'a Limits,
+    /// Changes within their dead bands are not made.
+    settled: bool,
     table: CommandTable,
     reasons: Vec<Reason>,
 }
 
 impl Plan<'_> {
+    fn planned(mut self) -> Self {
+        let bends = self.nominal.lra.bends.len();
+        (0..bends).for_each(|i| self.angle(i));
+        (0..bends).for_each(|i| self.rotation(i));
+        self.lengths();
+        self
+    }
+
+    /// What is too small to be changed: noise while all is settled, else what the machine cannot make.
+    fn dead_band(&self, tolerance: f64, sigma: f64, resolution: f64) -> f64 {
+        if self.settled { dead_band(tolerance, sigma) } else { 0.5 * resolution }
+    }
+
     fn angle(&mut self, i: usize) {
         let wanted = self.nominal.lra.bends[i].angle_rad;
         let measured = &self.newest.measured.bends[i];
         let change = Change {
             current: self.table.bends[i].angle_rad,
             wanted: self.model.springback.command_for(i, wanted),
-            dead_band: dead_band(self.nominal.tolerance.angle_rad, measured.angle_sigma_rad),
+            dead_band: self.dead_band(
+                self.nominal.tolerance.angle_rad,
+                measured.angle_sigma_rad,
+                self.limits.machine.angle_resolution_rad,
+            ),
             step: self.limits.step_angle_rad.max(3.0 * self.model.springback.surprise_sigma_rad(i)),
         };
         let Some(value) = change.apply() else { return };
@@ -141,7 +169,7 @@ impl Plan<'_> {
         let change = Change {
             current,
             wanted: current + wrap_angle(self.model.rotations.command_for(i, wanted) - current),
-            dead_band: dead_band(tolerance, found.sigma),
+            dead_band: self.dead_band(tolerance, found.sigma, self.limits.machine.angle_resolution_rad),
             step: self.limits.step_rotation_rad,
         };
         let Some(value) = change.apply() else { return };
@@ -167,7 +195,11 @@ impl Plan<'_> {
             let change = Change {
                 current: self.table.bends[i].length_mm,
                 wanted: self.model.lengths.command_for(i, &angles),
-                dead_band: dead_band(self.nominal.tolerance.length_mm, found.map_or(0.0, |f| f.sigma)),
+                dead_band: self.dead_band(
+                    self.nominal.tolerance.length_mm,
+                    found.map_or(0.0, |f| f.sigma),
+                    self.limits.machine.length_resolution_mm,
+                ),
                 step: self.limits.step_length_mm.max(3.0 * self.model.lengths.surprise_sigma_mm(i)),
             };
             let Some(value) = change.apply() else { continue };

@@ -4,8 +4,9 @@
 use super::estimate::{Outlier, Springback};
 use super::history::{History, Part};
 use super::knowledge::{Key, Knowledge};
-use super::lengths::{Lengths, Rotations};
+use super::lengths::Lengths;
 use super::plan::{self, Limits};
+use super::rotations::Rotations;
 use super::verdict::{Code, Reason};
 use crate::inspect::{self, Known};
 use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
@@ -82,7 +83,7 @@ pub fn replay(job: &Job, turn_newest: bool) -> Replay {
     let model = Model {
         springback: Springback::prior(nominal, &records, history.batch.as_deref()),
         lengths: Lengths::prior(&nominal.lra, &records),
-        rotations: Rotations::prior(nominal.lra.bends.len()),
+        rotations: Rotations::prior(&nominal.lra, &records),
     };
     let mut out = Replay { model, used: Vec::new(), newest: Newest::None, left_out: Vec::new() };
     for (i, part) in history.parts.iter().enumerate() {

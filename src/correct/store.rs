@@ -7,6 +7,7 @@ use std::path::Path;
 use thiserror::Error;
 
 use super::Knowledge;
+use super::knowledge::VERSION;
 
 /// Why a knowledge file cannot be used.
 #[derive(Debug, Error)]
@@ -40,8 +41,8 @@ pub fn load(path: &Path) -> Result<Knowledge, StoreError> {
     let knowledge: Knowledge = serde_json::from_str(&text)
         .map_err(|e| StoreError::Syntax { file: file.clone(), detail: e.to_string() })?;
     match knowledge.version {
-        1 => Ok(knowledge),
-        other => Err(StoreError::Syntax { file, detail: format!("version = {other}, allowed is 1") }),
+        VERSION => Ok(knowledge),
+        other => Err(StoreError::Syntax { file, detail: format!("version = {other}, allowed is {VERSION}") }),
     }
 }
 

@@ -7,6 +7,7 @@
 //! story     what is told before, between and after
 //! picture   all parts as one SVG
 //! deliveries  many deliveries over a link that fails
+//! production  many jobs on simulated benders, beside the best that is possible
 //! accuracy  how right and how accurate the reconstruction is
 //! ```
 
@@ -14,6 +15,7 @@ pub mod accuracy;
 pub mod deliveries;
 mod demo;
 mod picture;
+pub mod production;
 mod record;
 mod shop;
 mod story;

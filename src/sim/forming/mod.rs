@@ -1,18 +1,22 @@
 //! The simulated material in the simulated bender: what a table really makes of a tube.
 //!
-//! Drawn once per key (bender, die, tube, material): how far reality is off the beam formula, the fixed part of
-//! spring-back, its split between arc and ends, backlash, elongation. Per batch and per tube: scale. Per program:
-//! a residual for each bend. Per bend: scatter. The figures are assumptions listed in the field notes ("A
-//! believable simulated bender"). Nothing here is shared with `correct`, so that the loop is tested on a world
-//! that it does not know.
+//! Drawn once per key (bender, die, tube, material): how far reality is off the [`law`], the law's fixed part, the split of
+//! spring-back between arc and ends, backlash, elongation. Per batch and per tube: scale. Per program: a residual for each
+//! bend. Per bend: scatter. The figures are assumptions listed in the field notes ("A believable simulated bender").
+//! Nothing here is shared with `correct`, so that the loop is tested on a world that it does not know.
 
-use std::f64::consts::FRAC_PI_2;
+pub mod curves;
+pub mod law;
+
+use std::sync::Arc;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Exp1, StandardNormal};
 
 use crate::tube::{Bend, CommandTable, Lra, Nominal};
+use curves::Curve;
+use law::{Law, elastic_share};
 
 /// A tube as it leaves the machine.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,13 +27,73 @@ pub struct FormedTube {
     pub ovality: Vec<f64>,
 }
 
+/// What kind of bender it is: how spring-back depends on the angle, and how it scatters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct World {
+    /// One of these per key; none: the beam formula.
+    pub curves: Vec<Arc<Curve>>,
+    /// Logarithmic scatter from tube to tube, common to its bends.
+    pub tube_sigma: f64,
+    /// Scatter from bend to bend, and what comes to it as a share of the spring-back.
+    pub bend_sigma_rad: f64,
+    /// That share.
+    pub bend_share: f64,
+    /// What a bend of a program is off by, always (one sigma).
+    pub residual_sigma_rad: f64,
+}
+
+impl World {
+    /// The believable bender.
+    pub fn believable() -> World {
+        World {
+            curves: Vec::new(),
+            tube_sigma: 0.015,
+            bend_sigma_rad: 0.05 * DEGREE,
+            bend_share: 0.008,
+            residual_sigma_rad: 0.10 * DEGREE,
+        }
+    }
+
+    /// A plainer one, to compare with studies: bends scatter by 0.08 degrees, tubes of a batch do not.
+    pub fn plain() -> World {
+        World { tube_sigma: 0.0, bend_sigma_rad: 0.08 * DEGREE, bend_share: 0.0, ..World::believable() }
+    }
+}
+
+/// What is drawn for a key is drawn from here.
+pub mod spread {
+    use super::DEGREE;
+
+    /// Logarithmic scale of a key.
+    pub const KEY: f64 = 0.30;
+    /// Logarithmic scale of a batch: from, to; drawn per key.
+    pub const BATCH: [f64; 2] = [0.05, 0.12];
+    /// The fixed part of spring-back: median, logarithmic sigma, least, most.
+    pub const FIXED_RAD: f64 = 0.7 * DEGREE;
+    /// Its logarithmic sigma.
+    pub const FIXED_SIGMA: f64 = 0.4;
+    /// Its range.
+    pub const FIXED_RANGE_RAD: [f64; 2] = [0.3 * DEGREE, 1.5 * DEGREE];
+    /// Share of the spring-back that opens the arc.
+    pub const IN_ARC: [f64; 2] = [0.5, 0.8];
+    /// Backlash.
+    pub const BACKLASH_RAD: [f64; 2] = [0.05 * DEGREE, 0.15 * DEGREE];
+    /// Small errors of the feed; how often the clamp slips, and how far on average.
+    pub const FEED_MM: f64 = 0.08;
+    /// How often.
+    pub const SLIP_SHARE: f64 = 0.03;
+    /// How far on average.
+    pub const SLIP_MM: f64 = 0.6;
+    /// Scatter of the plane's turn.
+    pub const TURN_RAD: f64 = 0.08 * DEGREE;
+}
+
 /// What stays while bender, die, tube and material stay.
 #[derive(Debug, Clone)]
 struct Key {
     /// Real over computed spring-back.
     scale: f64,
-    /// Spring-back that even a long bend has on top of the proportional part.
-    fixed_rad: f64,
+    law: Law,
     /// Share of the spring-back that opens the arc; the rest straightens its ends.
     in_arc: f64,
     /// Sigma of a batch's logarithmic scale.
@@ -42,6 +106,7 @@ struct Key {
 #[derive(Debug, Clone)]
 pub struct Plant {
     rng: ChaCha8Rng,
+    world: World,
     part: Nominal,
     key: Key,
     batch_scale: f64,
@@ -51,24 +116,36 @@ pub struct Plant {
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
-/// Over this bend angle the fixed part of spring-back builds up.
-const FIXED_PART_ANGLE_RAD: f64 = 12.0 * DEGREE;
-
 impl Plant {
-    /// Sets a bender up for a part: tube, material and die are the part's, everything else is drawn.
+    /// Sets the believable bender up for a part: tube, material and die are the part's, everything else is drawn.
     pub fn new(part: &Nominal, seed: u64) -> Plant {
+        Plant::of(World::believable(), part, seed)
+    }
+
+    /// Sets up a bender of this kind.
+    pub fn of(world: World, part: &Nominal, seed: u64) -> Plant {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let scale = (spread::KEY * normal(&mut rng)).exp();
+        let fixed_rad = spread::FIXED_RAD * (spread::FIXED_SIGMA * normal(&mut rng)).exp();
+        let [least, most] = spread::FIXED_RANGE_RAD;
+        let between = |rng: &mut ChaCha8Rng, [from, to]: [f64; 2]| rng.random_range(from..to);
         let key = Key {
-            scale: (0.30 * normal(&mut rng)).exp(),
-            fixed_rad: (0.7 * (0.4 * normal(&mut rng)).exp()).clamp(0.3, 1.5) * DEGREE,
-            in_arc: rng.random_range(0.5..0.8),
-            batch_sigma: rng.random_range(0.05..0.12),
-            backlash_rad: rng.random_range(0.05..0.15) * DEGREE,
+            scale,
+            law: Law::Beam { fixed_rad: fixed_rad.clamp(least, most) },
+            in_arc: between(&mut rng, spread::IN_ARC),
+            batch_sigma: between(&mut rng, spread::BATCH),
+            backlash_rad: between(&mut rng, spread::BACKLASH_RAD),
             elongation: (0.012 + 0.004 * normal(&mut rng)).max(0.0),
         };
-        let mut plant = Plant { rng, part: part.clone(), key, batch_scale: 1.0, residual_rad: Vec::new() };
+        let (part, residual_rad) = (part.clone(), Vec::new());
+        let mut plant = Plant { rng, world, part, key, batch_scale: 1.0, residual_rad };
+        if !plant.world.curves.is_empty() {
+            let which = plant.rng.random_range(0..plant.world.curves.len());
+            plant.key.law = Law::Curve(Arc::clone(&plant.world.curves[which]));
+        }
+        let part = plant.part.clone();
         plant.new_batch();
-        plant.new_program(part);
+        plant.new_program(&part);
         plant
     }
 
@@ -77,16 +154,21 @@ impl Plant {
         self.batch_scale = (self.key.batch_sigma * normal(&mut self.rng)).exp();
     }
 
+    /// The tubes spring back by another factor from now on, whatever batch they are said to be of.
+    pub fn shift_batch(&mut self, factor: f64) {
+        self.batch_scale *= factor;
+    }
+
     /// Another part on the same die, bent from the same tube: new residuals per bend.
     pub fn new_program(&mut self, part: &Nominal) {
         self.part = part.clone();
-        let rng = &mut self.rng;
-        self.residual_rad = part.lra.bends.iter().map(|_| 0.10 * DEGREE * normal(rng)).collect();
+        let (rng, sigma_rad) = (&mut self.rng, self.world.residual_sigma_rad);
+        self.residual_rad = part.lra.bends.iter().map(|_| sigma_rad * normal(rng)).collect();
     }
 
     /// Bends one tube. Rows beyond the part's own count are bent without a residual.
     pub fn bend(&mut self, commanded: &CommandTable, cut_length_mm: f64) -> FormedTube {
-        let tube_scale = (0.015 * normal(&mut self.rng)).exp();
+        let tube_scale = (self.world.tube_sigma * normal(&mut self.rng)).exp();
         let mut left_mm = cut_length_mm + 0.2 * normal(&mut self.rng);
         let mut out = FormedTube { lra: Lra::default(), ovality: Vec::new() };
         let (mut carried_mm, mut lag_rad) = (0.0, 0.0);
@@ -97,11 +179,9 @@ impl Plant {
             let radius_mm = self.part.lra.bends.get(i).map_or(self.part.die_clr_mm, |b| b.radius_mm);
             let springback_rad = self.springback_rad(i, row.angle_rad, radius_mm, tube_scale);
             let bent_mm = radius_mm * row.angle_rad;
-            // Part of the spring-back opens the arc, whose length stays; the rest straightens both its ends.
-            let open_rad = (row.angle_rad - self.key.in_arc * springback_rad).max(1e-9);
-            let formed_radius_mm = if bent_mm > 0.0 { bent_mm / open_rad } else { radius_mm };
             let angle_rad = row.angle_rad - springback_rad;
-            let straightened_mm = formed_radius_mm * (open_rad - angle_rad).max(0.0) / 2.0;
+            let (formed_radius_mm, straightened_mm) =
+                opened(radius_mm, row.angle_rad, angle_rad, self.key.in_arc);
             out.lra.bends.push(Bend {
                 length_mm: feed_mm + carried_mm + straightened_mm,
                 rotation_rad,
@@ -118,54 +198,41 @@ impl Plant {
 
     /// Commanded minus formed angle, at most the whole angle.
     fn springback_rad(&mut self, bend: usize, commanded_rad: f64, radius_mm: f64, tube_scale: f64) -> f64 {
-        let fixed = self.key.fixed_rad * (1.0 - (-commanded_rad / FIXED_PART_ANGLE_RAD).exp());
-        let elastic = elastic_share(&self.part, radius_mm) * commanded_rad;
-        let usual = (fixed + elastic) * self.key.scale * self.batch_scale * tube_scale;
-        let scatter = (0.05 * DEGREE + 0.008 * usual) * normal(&mut self.rng);
+        let share = elastic_share(&self.part, radius_mm);
+        let mean = self.key.law.springback_rad(share, commanded_rad);
+        let usual = mean * self.key.scale * self.batch_scale * tube_scale;
+        let scatter = (self.world.bend_sigma_rad + self.world.bend_share * usual) * normal(&mut self.rng);
         let residual = self.residual_rad.get(bend).copied().unwrap_or(0.0);
         (usual + residual + scatter).clamp(0.0, commanded_rad)
     }
 
     /// Small errors, and now and then the clamp slips and the feed comes out short.
     fn feed_error_mm(&mut self) -> f64 {
-        let slip: f64 = if self.rng.random_bool(0.03) { Exp1.sample(&mut self.rng) } else { 0.0 };
-        0.08 * normal(&mut self.rng) - 0.6 * slip
+        let slip: f64 =
+            if self.rng.random_bool(spread::SLIP_SHARE) { Exp1.sample(&mut self.rng) } else { 0.0 };
+        spread::FEED_MM * normal(&mut self.rng) - spread::SLIP_MM * slip
     }
 
     /// The plane's turn between two bends, and by how much the head now lags: backlash follows the direction
     /// of the last move.
     fn turned(&mut self, commanded_rad: f64, lag_rad: f64) -> (f64, f64) {
-        let lag = if commanded_rad == 0.0 {
-            lag_rad
-        } else {
-            -self.key.backlash_rad / 2.0 * commanded_rad.signum()
-        };
-        (commanded_rad + lag - lag_rad + 0.08 * DEGREE * normal(&mut self.rng), lag)
+        let lag = lag_after(commanded_rad, lag_rad, self.key.backlash_rad);
+        (commanded_rad + lag - lag_rad + spread::TURN_RAD * normal(&mut self.rng), lag)
     }
 }
 
-/// Elastic recovery over bend angle, M R / (E I), with the moment integrated over a thin-walled section that
-/// is elastic up to yield and hardens as K eps^n beyond.
-fn elastic_share(part: &Nominal, radius_mm: f64) -> f64 {
-    const STEPS: u32 = 64;
-    let m = &part.material;
-    let middle_mm = (part.od_mm - part.wall_mm) / 2.0;
-    let stress_mpa = |strain: f64| {
-        let elastic = m.youngs_modulus_mpa * strain;
-        if elastic < m.yield_mpa {
-            elastic
-        } else {
-            m.yield_mpa.max(m.strength_coefficient_mpa * strain.powf(m.hardening_exponent)).min(elastic)
-        }
-    };
-    let slice = |k: u32| {
-        let height_mm = middle_mm * (FRAC_PI_2 * (f64::from(k) + 0.5) / f64::from(STEPS)).sin();
-        stress_mpa(height_mm / radius_mm) * height_mm
-    };
-    let sum: f64 = (0..STEPS).map(slice).sum();
-    let moment = 4.0 * middle_mm * part.wall_mm * sum * FRAC_PI_2 / f64::from(STEPS);
-    let stiffness = m.youngs_modulus_mpa * std::f64::consts::PI * middle_mm.powi(3) * part.wall_mm;
-    moment * radius_mm / stiffness
+/// Backlash follows the direction of the last move.
+pub fn lag_after(commanded_rad: f64, lag_rad: f64, backlash_rad: f64) -> f64 {
+    if commanded_rad == 0.0 { lag_rad } else { -backlash_rad / 2.0 * commanded_rad.signum() }
+}
+
+/// Radius that a bend opens to, and what straightens at each of its ends: part of the spring-back opens the arc, whose length
+/// stays; the rest straightens both its ends.
+pub fn opened(radius_mm: f64, commanded_rad: f64, formed_rad: f64, in_arc: f64) -> (f64, f64) {
+    let bent_mm = radius_mm * commanded_rad;
+    let open_rad = (commanded_rad - in_arc * (commanded_rad - formed_rad)).max(1e-9);
+    let formed_radius_mm = if bent_mm > 0.0 { bent_mm / open_rad } else { radius_mm };
+    (formed_radius_mm, formed_radius_mm * (open_rad - formed_rad).max(0.0) / 2.0)
 }
 
 fn normal(rng: &mut ChaCha8Rng) -> f64 {

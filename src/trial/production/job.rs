@@ -1,0 +1,193 @@
+//! One simulated job: tube after tube is bent, scanned and corrected. The same seed gives every controller the same plant, the same
+//! scatter and the same errors of the scans.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::controllers::{Controller, Said, Scanned, Who, wants_rescan};
+use super::oracle::angles::Mishaps;
+use super::scanner::Scanner;
+use super::truth::Truth;
+use crate::correct::Verdict;
+use crate::sim::forming::{FormedTube, Plant, World};
+use crate::tube::{CommandTable, MeasuredTube, Nominal};
+
+const DEGREE: f64 = std::f64::consts::PI / 180.0;
+
+/// Scans of one tube, at most.
+const SCANS: usize = 3;
+
+/// What happens in a job.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Scenario {
+    /// Nothing is known of the key.
+    Cold,
+    /// Another part was bent on it before: so many tubes, and of the same batch or not.
+    Known {
+        /// Tubes that were learned from.
+        learned: usize,
+        /// Whether the batch is the same.
+        same_batch: bool,
+    },
+    /// Before this part (from 0) the tubes change, unannounced: their spring-back by this factor or its inverse.
+    Shift {
+        /// The first tube of the new ones.
+        at: usize,
+        /// Factor.
+        factor: f64,
+    },
+    /// This share of the angles is measured 3 degrees off.
+    Gross {
+        /// Share.
+        share: f64,
+    },
+}
+
+/// Where a job is done.
+#[derive(Debug, Clone)]
+pub struct Shop {
+    /// The plant.
+    pub world: World,
+    /// The scan arm.
+    pub scanner: Scanner,
+    /// What happens.
+    pub scenario: Scenario,
+    /// Tubes that are bent of the part that counts.
+    pub parts: usize,
+}
+
+/// One tube of a job.
+#[derive(Debug, Clone)]
+pub struct Tube {
+    /// What it really is.
+    pub truth: Truth,
+    /// Whether that is good.
+    pub good: bool,
+    /// benderd's verdict after its last scan.
+    pub verdict: Option<Verdict>,
+    /// How often it was scanned.
+    pub scans: usize,
+}
+
+/// A job under way.
+pub struct Job<'a> {
+    shop: &'a Shop,
+    seed: u64,
+    plant: Plant,
+    controller: Box<dyn Controller>,
+    table: CommandTable,
+    revision: u64,
+    bent: u64,
+}
+
+impl Shop {
+    fn mishaps(&self) -> Mishaps {
+        match self.scenario {
+            Scenario::Gross { share } => Mishaps { gross: share, ..Mishaps::default() },
+            Scenario::Shift { factor, .. } => {
+                Mishaps { shift: (1.0 / self.parts as f64, factor.ln()), ..Mishaps::default() }
+            }
+            _ => Mishaps::default(),
+        }
+    }
+
+    /// Does a whole job; `before` is the part that a known key was learned with.
+    pub fn run(&self, who: Who, part: &Nominal, before: &Nominal, seed: u64) -> Vec<Tube> {
+        match self.scenario {
+            Scenario::Known { learned, same_batch } => {
+                let mut job = Job::begin(self, who, before, seed);
+                (0..learned).for_each(|_| drop(job.tube(before)));
+                job.change(part, same_batch);
+                (0..self.parts).map(|_| job.tube(part)).collect()
+            }
+            _ => {
+                let mut job = Job::begin(self, who, part, seed);
+                let tube = |k| {
+                    job.may_shift(k);
+                    job.tube(part)
+                };
+                (0..self.parts).map(tube).collect()
+            }
+        }
+    }
+}
+
+impl<'a> Job<'a> {
+    /// Sets everything up.
+    pub fn begin(shop: &'a Shop, who: Who, part: &Nominal, seed: u64) -> Job<'a> {
+        let plant = Plant::of(shop.world.clone(), part, seed);
+        let mut controller = who.begin(&shop.world, part, shop.mishaps());
+        let table = controller.first();
+        Job { shop, seed, plant, controller, table, revision: 1, bent: 0 }
+    }
+
+    fn change(&mut self, part: &Nominal, same_batch: bool) {
+        if !same_batch {
+            self.plant.new_batch();
+        }
+        self.plant.new_program(part);
+        self.controller.new_program(part, same_batch);
+        self.table = self.controller.first();
+        self.revision += 1;
+    }
+
+    fn may_shift(&mut self, tube: usize) {
+        if let Scenario::Shift { at, factor } = self.shop.scenario
+            && at == tube
+        {
+            self.plant.shift_batch(if self.seed.is_multiple_of(2) { factor } else { 1.0 / factor });
+        }
+    }
+
+    /// Bends a tube, scans it as often as is asked for, and takes the next table.
+    pub fn tube(&mut self, part: &Nominal) -> Tube {
+        let formed = self.bend(part);
+        let truth = Truth::of(&formed.lra, part);
+        let mut said = self.take(self.scan(&formed, part, 0), 0);
+        let mut scans = 1;
+        while wants_rescan(&said) && scans < SCANS {
+            said = self.take(self.scan(&formed, part, scans), scans);
+            scans += 1;
+        }
+        let verdict = said.answer.as_ref().map(|answer| answer.verdict);
+        self.put(said.table);
+        Tube { truth, good: truth.is_good(part), verdict, scans }
+    }
+
+    /// Bends a tube with the table in force.
+    pub fn bend(&mut self, part: &Nominal) -> FormedTube {
+        self.bent += 1;
+        self.plant.bend(&self.table, part.lra.developed_length_mm())
+    }
+
+    /// Scans the tube that was bent last.
+    pub fn scan(&self, formed: &FormedTube, part: &Nominal, again: usize) -> MeasuredTube {
+        let stream = self.bent * SCANS as u64 + again as u64;
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x5ca9_0000);
+        rng.set_stream(stream);
+        let mut measured = self.shop.scanner.scan(&formed.lra, part.od_mm / 2.0, &mut rng);
+        if let Scenario::Gross { share } = self.shop.scenario {
+            for bend in &mut measured.bends {
+                let (wrong, more) = (rng.random_bool(share), rng.random_bool(0.5));
+                let off = if more { 3.0 * DEGREE } else { -3.0 * DEGREE };
+                bend.angle_rad = (bend.angle_rad + if wrong { off } else { 0.0 }).max(0.0);
+            }
+        }
+        measured
+    }
+
+    /// Shows a scan of the tube that was bent last.
+    pub fn take(&mut self, measured: MeasuredTube, again: usize) -> Said {
+        let scan_id = format!("{}-{}-{again}", self.seed, self.bent);
+        let (commanded, revision) = (self.table.clone(), self.revision);
+        self.controller.next(Scanned { commanded, measured, revision, scan_id })
+    }
+
+    /// Puts a table in force.
+    pub fn put(&mut self, table: CommandTable) {
+        if table != self.table {
+            self.revision += 1;
+            self.table = table;
+        }
+    }
+}
