@@ -96,7 +96,9 @@ impl Shop {
         match self.scenario {
             Scenario::Known { learned, same_batch } => {
                 let mut job = Job::begin(self, who, before, seed);
-                (0..learned).for_each(|_| drop(job.tube(before)));
+                for _ in 0..learned {
+                    job.tube(before);
+                }
                 job.change(part, same_batch);
                 (0..self.parts).map(|_| job.tube(part)).collect()
             }
