@@ -33,8 +33,8 @@ const TUBE_SCATTER: f64 = 0.015;
 const DRIFT: f64 = 0.01;
 /// A change of all bends together that is more than drift: the sum of what each part was off, in sigmas and less by this each time
 /// (E. S. Page's cumulative sum, 1954), up to that. Then all of x is open again.
-const CHANGE_LESS: f64 = 0.5;
-const CHANGE: f64 = 3.0;
+const CHANGE_LESS: f64 = 0.8;
+const CHANGE: f64 = 2.0;
 /// Common scale of another job's spring-back: of the same batch, of another or an unknown one.
 const SAME_BATCH: f64 = 0.02;
 const OTHER_BATCH: f64 = 0.10;
@@ -133,6 +133,7 @@ impl Springback {
         for (i, m) in measured.iter().enumerate() {
             self.surprise_sigma_rad[i] = self.measured_at(i, commanded_rad[i], m.sigma).sigma;
         }
+        self.notice_change(&rows, &found, &variances);
         let (mut heard, mut outliers): (Vec<usize>, Vec<Outlier>) = ((0..found.len()).collect(), Vec::new());
         let before = std::mem::replace(&mut self.suspect, vec![false; found.len()]);
         // One after the other, the worst first: it spoils what the others are held against.
@@ -153,7 +154,6 @@ impl Springback {
                 variances[expected.bend] += expected.expected_rad.sigma.powi(2) * (off.powi(2) - 1.0);
             }
         }
-        self.notice_change(&heard, &rows, &found, &variances);
         heard.extend((0..found.len()).filter(|&i| self.suspect[i] && before[i]));
         let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
         let (values, kept) = (pick(&found), heard.iter().map(|&i| rows[i].clone()).collect::<Vec<_>>());
@@ -161,14 +161,27 @@ impl Springback {
         outliers
     }
 
-    /// Whether all bends together spring back by another factor than they did.
-    fn notice_change(&mut self, heard: &[usize], rows: &[DVector<f64>], found: &[f64], variances: &[f64]) {
+    /// Whether all bends together spring back by another factor than they did. Comes first: bends that changed together must not pass for
+    /// single ones that are wrong; and those that are, far from the bends' median, have no say.
+    fn notice_change(&mut self, rows: &[DVector<f64>], found: &[f64], variances: &[f64]) {
         let usual = self.along(SHAPE);
+        let per_factor: Vec<f64> = rows.iter().map(|row| row.dot(&usual)).collect();
+        let off: Vec<f64> =
+            rows.iter().zip(found).map(|(row, found)| found - self.belief.predict(row).value).collect();
+        let mut factors: Vec<f64> = off.iter().zip(&per_factor).map(|(off, per)| off / per).collect();
+        factors.sort_by(f64::total_cmp);
+        let median = 0.5 * (factors[(factors.len() - 1) / 2] + factors[factors.len() / 2]);
+        let fits = |i: &usize| {
+            let sigma = variances[*i].sqrt().hypot(RESIDUAL_SIGMA_RAD);
+            (off[*i] - median * per_factor[*i]).abs() < REJECT * sigma
+        };
+        let heard: Vec<usize> = (0..found.len()).filter(fits).collect();
         let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
-        let (values, kept) = (pick(found), heard.iter().map(|&i| rows[i].clone()).collect::<Vec<_>>());
-        let per_factor: Vec<f64> = kept.iter().map(|row| row.dot(&usual)).collect();
-        let noise = noise(&values, &pick(variances));
-        let Some(factor) = self.belief.common_factor(&kept, &per_factor, &values, &noise) else { return };
+        let kept: Vec<DVector<f64>> = heard.iter().map(|&i| rows[i].clone()).collect();
+        let noise = noise(&pick(found), &pick(variances));
+        let Some(factor) = self.belief.common_factor(&kept, &pick(&per_factor), &pick(found), &noise) else {
+            return;
+        };
         let off = factor.value / factor.sigma;
         // What nothing was known of before cannot have changed.
         if std::mem::replace(&mut self.has_learned, true) {
