@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Runs inside.sh in user-mode Linux, a kernel with CAN as an ordinary process: this machine's own kernel needs none. The
-# guest sees this machine's files, read only; it is killed when it is done, or after two minutes and four seconds for each
+# guest sees this machine's files, read only; it is killed when it is done, or after two minutes and eight seconds for each
 # delivery. Where it does not come up, the reason is printed and nothing is tested.
 # Usage: run.sh BINARY [COUNT] (after install.sh); so many deliveries go over vcan0 for each of its protocols, 5 unless said.
 set -euo pipefail
@@ -49,7 +49,7 @@ exec sleep 1000
 INIT
 chmod +x "$work/init"
 
-begin=$SECONDS limit=$((120 + 4 * count))
+begin=$SECONDS limit=$((120 + 8 * count))
 setsid linux.uml mem=512M quiet uml_dir="$work/uml" rootfstype=hostfs rootflags=/ ro init="$work/init" \
     con=null con0=fd:0,fd:1 >"$work/console" 2>&1 </dev/null &
 guest=$!
