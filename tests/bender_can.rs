@@ -7,14 +7,13 @@
 use std::time::Duration;
 
 use benderd::bender::can::{Bus, CanPort, MemoryBus, Socket, open_port};
-use benderd::bender::{
-    Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, Transport, deliver,
-};
+use benderd::bender::{Bender as _, Job, Link, Operation, Outcome, Profile, Transport, deliver};
 use benderd::config::Document;
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::Door;
 use benderd::sim::faults::Fault;
+use benderd::trial::deliveries::Memory;
 use benderd::tube::{CommandRow, CommandTable};
 use tokio::time::Instant;
 
@@ -75,20 +74,6 @@ fn machine(meeting: &Meeting, profile: &Profile, fault: Option<Fault>) -> Simula
     SimulatedBender::start(door, MachineModel::new(profile.clone(), "P1", 3), fault, |_| ()).unwrap()
 }
 
-#[derive(Default)]
-struct Memory(Vec<Intent>);
-
-impl IntentLog for Memory {
-    fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
-        self.0.push(intent.clone());
-        Ok(())
-    }
-
-    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
-        Ok(())
-    }
-}
-
 fn job(length_mm: f64) -> Job {
     let row = CommandRow { length_mm, rotation_rad: -0.5, angle_rad: 1.25 };
     let table = CommandTable { bends: vec![row; 3], last_length_mm: 50.0 };
@@ -105,7 +90,7 @@ async fn deliveries(meeting: Meeting, way: (&str, &str, &str)) {
         let begun = Instant::now();
         let outcome = deliver(&mut link, &job(length_mm), &mut log).await;
         assert!(matches!(outcome, Outcome::Applied(_)), "{way:?}: {outcome:?}");
-        assert_eq!((machine.with(|m| m.active()).revision, log.0.len()), (revision, 1));
+        assert_eq!((machine.with(|m| m.active()).revision, log.intents.len()), (revision, 1));
         let active = link.read_active().await.unwrap();
         assert_eq!(active.payload, machine.with(|m| m.active_payload()));
         println!("{} {}: a table of 3 bends in {} ms", way.0, way.2, begun.elapsed().as_millis());
@@ -129,7 +114,7 @@ async fn machines_on_one_bus_get_their_own_tables() {
     let machines = profiles.each_ref().map(|profile| machine(&meeting, profile, None));
     let [mut a, mut b, mut c] = profiles.each_ref().map(|profile| meeting.link(profile));
     let [first, second, third] = [100.0, 200.0, 300.0].map(job);
-    let [mut log_a, mut log_b, mut log_c] = [const { Memory(Vec::new()) }; 3];
+    let [mut log_a, mut log_b, mut log_c] = [(), (), ()].map(|()| Memory::default());
     let outcomes = tokio::join!(
         deliver(&mut a, &first, &mut log_a),
         deliver(&mut b, &second, &mut log_b),
@@ -171,7 +156,7 @@ async fn a_commit_whose_echo_is_lost_is_found_out_by_reading() {
             let outcome = deliver(&mut meeting.link(&profile), &job(100.0), &mut log).await;
             assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
             assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
-            assert_eq!((machine.with(|m| m.active()).revision == 1, log.0.len()), (applied, 1));
+            assert_eq!((machine.with(|m| m.active()).revision == 1, log.intents.len()), (applied, 1));
         }
     }
 }

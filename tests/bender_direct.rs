@@ -3,27 +3,14 @@
 #![allow(clippy::unwrap_used)] // clippy does not count the helpers of an integration test as test code
 
 use assert_cmd::Command;
-use benderd::bender::{
-    Bender as _, Intent, IntentLog, Job, Link, LogError, Operation, Outcome, Profile, deliver,
-};
+use benderd::bender::{Bender as _, Job, Link, Operation, Outcome, Profile, deliver};
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::Door;
 use benderd::sim::reply_fault::ReplyFault;
 use benderd::sim::trouble::WireFaults;
+use benderd::trial::deliveries::Memory;
 use benderd::tube::{CommandRow, CommandTable};
-
-struct Nothing;
-
-impl IntentLog for Nothing {
-    fn intent(&mut self, _: &Intent) -> Result<(), LogError> {
-        Ok(())
-    }
-
-    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
-        Ok(())
-    }
-}
 
 async fn machine() -> (SimulatedBender, Link) {
     let mut profile = Profile::load("ten-row").unwrap();
@@ -56,17 +43,17 @@ fn rejected(outcome: &Outcome) -> String {
 #[tokio::test]
 async fn rows_go_in_with_the_operators_approval_and_not_without() {
     let (bender, mut link) = machine().await;
-    let refused = deliver(&mut link, &job(false), &mut Nothing).await;
+    let refused = deliver(&mut link, &job(false), &mut Memory::default()).await;
     assert!(rejected(&refused).contains("approve the write"), "{refused:?}");
     assert!(bender.with(|m| m.active_payload()).is_empty(), "nothing was written");
-    let outcome = deliver(&mut link, &job(true), &mut Nothing).await;
+    let outcome = deliver(&mut link, &job(true), &mut Memory::default()).await;
     assert!(matches!(outcome, Outcome::Applied(_)), "{outcome:?}");
     // Positions from the first row on, rounded there: nothing is lost along the table.
     let column = |first| bender.with(|m| m.read(first, 10).unwrap());
     assert_eq!(column(3523), [50, 101, 151, 202, 0, 0, 0, 0, 0, 0]);
     assert_eq!(column(3583), [0, 20, 41, 61, 0, 0, 0, 0, 0, 0]);
     assert_eq!(column(3553), [45, 45, 45, 45, 0, 0, 0, 0, 0, 0]);
-    let again = deliver(&mut link, &job(true), &mut Nothing).await;
+    let again = deliver(&mut link, &job(true), &mut Memory::default()).await;
     assert!(matches!(again, Outcome::AlreadyActive(_)), "{again:?}");
 }
 
@@ -91,7 +78,7 @@ fn printed_requests() -> Vec<[u16; 3]> {
 #[tokio::test]
 async fn a_delivery_asks_what_the_printed_plan_says() {
     let (_bender, mut link) = machine().await;
-    assert!(matches!(deliver(&mut link, &job(true), &mut Nothing).await, Outcome::Applied(_)));
+    assert!(matches!(deliver(&mut link, &job(true), &mut Memory::default()).await, Outcome::Applied(_)));
     let request = |line: String| {
         let frame = line.split_once(" > ")?.1.to_owned();
         let byte = |word: &str| u16::from_str_radix(word, 16).unwrap();
@@ -107,24 +94,26 @@ async fn a_delivery_asks_what_the_printed_plan_says() {
 async fn a_machine_that_runs_or_has_another_die_gets_nothing() {
     let (bender, mut link) = machine().await;
     bender.with(|m| m.set_between_parts(false));
-    let refused = deliver(&mut link, &job(true), &mut Nothing).await;
+    let refused = deliver(&mut link, &job(true), &mut Memory::default()).await;
     assert!(rejected(&refused).contains("\"running\" (bit 0) is on, must be off"), "{refused:?}");
     let mut other = Profile::load("ten-row").unwrap();
     other.identification = 76;
     let mut link = Link::new(other, bender.address()).unwrap();
-    let Outcome::NotApplied { why } = deliver(&mut link, &job(true), &mut Nothing).await else { panic!() };
+    let Outcome::NotApplied { why } = deliver(&mut link, &job(true), &mut Memory::default()).await else {
+        panic!()
+    };
     assert!(why.contains("register 2520 holds 60") && why.contains("another die"), "{why}");
 }
 
 #[tokio::test]
 async fn a_correction_names_what_somebody_changed_at_the_screen() {
     let (bender, mut link) = machine().await;
-    assert!(matches!(deliver(&mut link, &job(true), &mut Nothing).await, Outcome::Applied(_)));
+    assert!(matches!(deliver(&mut link, &job(true), &mut Memory::default()).await, Outcome::Applied(_)));
     bender.with(|m| m.write(3554, &[47]).unwrap());
     let mut correction = job(true);
     correction.table.bends[0].angle_rad = 46_f64.to_radians();
     correction.operation = Operation::Correct { last: job(true).table };
-    let refused = deliver(&mut link, &correction, &mut Nothing).await;
+    let refused = deliver(&mut link, &correction, &mut Memory::default()).await;
     assert_eq!(rejected(&refused), "bend 45.000 deg was committed, the machine holds 47.000");
 }
 
@@ -135,11 +124,11 @@ async fn half_a_table_is_unknown_and_the_next_delivery_makes_it_whole() {
     // Identification, rows, coils, rows again, twice before the commit; then the first column is written, and the second one's answer is lost.
     let answers = [None; 2 * 8 + 1].into_iter().chain([Some(ReplyFault::Lost)]);
     bender.set_wire_faults(Some(WireFaults::script(answers)));
-    let outcome = deliver(&mut link, &job(true), &mut Nothing).await;
+    let outcome = deliver(&mut link, &job(true), &mut Memory::default()).await;
     let Outcome::Unknown { why } = &outcome else { panic!("{outcome:?}") };
     assert!(why.contains("neither the old nor the new one"), "{why}");
     bender.set_wire_faults(None);
-    let outcome = deliver(&mut link, &job(true), &mut Nothing).await;
+    let outcome = deliver(&mut link, &job(true), &mut Memory::default()).await;
     assert!(matches!(outcome, Outcome::Applied(_)), "{outcome:?}");
 }
 

@@ -7,8 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use benderd::bender::{
-    Bender as _, Device, Intent, IntentLog, Job, Link, LinkError, LogError, Operation, Outcome, Profile,
-    TableId, Transport, Wire, deliver,
+    Bender as _, Device, Job, Link, LinkError, Operation, Outcome, Profile, TableId, Transport, Wire, deliver,
 };
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
@@ -18,7 +17,7 @@ use benderd::sim::frames::Framing;
 use benderd::sim::pty::machine_end;
 use benderd::sim::reply_fault::ReplyFault;
 use benderd::sim::trouble::WireFaults;
-use benderd::trial::deliveries::{Ending, Totals, in_memory, real, run};
+use benderd::trial::deliveries::{Ending, Memory, Totals, in_memory, real, run};
 use benderd::tube::{CommandRow, CommandTable};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
 use tokio::sync::mpsc;
@@ -208,18 +207,6 @@ async fn a_table_is_delivered_through_a_pseudo_terminal() {
     }
 }
 
-struct Nothing;
-
-impl IntentLog for Nothing {
-    fn intent(&mut self, _: &Intent) -> Result<(), LogError> {
-        Ok(())
-    }
-
-    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
-        Ok(())
-    }
-}
-
 fn job(length_mm: f64) -> Job {
     let row = CommandRow { length_mm, rotation_rad: 0.0, angle_rad: 1.0 };
     let table = CommandTable { bends: vec![row], last_length_mm: 50.0 };
@@ -239,7 +226,7 @@ async fn a_commit_that_is_not_answered_on_a_line_or_in_a_folder_is_found_out() {
         let (mut ends, _kept) = real(&profile, folder.path()).await.unwrap();
         let model = MachineModel::new(profile, "P1", 1);
         let _bender = SimulatedBender::start(ends.door, model, Some(fault), |_| ()).unwrap();
-        let outcome = deliver(&mut ends.link, &job(100.0), &mut Nothing).await;
+        let outcome = deliver(&mut ends.link, &job(100.0), &mut Memory::default()).await;
         assert_eq!(matches!(outcome, Outcome::Applied(_)), applied, "{name}: {outcome:?}");
         assert_eq!(matches!(outcome, Outcome::NotApplied { .. }), !applied, "{name}: {outcome:?}");
     }
@@ -270,7 +257,7 @@ async fn two_machines_share_a_folder() {
     };
     let benders = [start(ends.door, one), start(others.door, two)];
     let [first, second] = [job(100.0), job(200.0)];
-    let (mut log, mut other_log) = (Nothing, Nothing);
+    let (mut log, mut other_log) = (Memory::default(), Memory::default());
     let outcomes = tokio::join!(
         deliver(&mut ends.link, &first, &mut log),
         deliver(&mut others.link, &second, &mut other_log)
@@ -309,7 +296,7 @@ async fn logged(level: tracing::Level, fault: Option<Fault>) -> String {
     let model = MachineModel::new(profile, "P1", 1);
     let _bender = SimulatedBender::start(ends.door, model, fault, |_| ()).unwrap();
     let _here = tracing::subscriber::set_default(subscriber);
-    let outcome = deliver(&mut ends.link, &job(100.0), &mut Nothing).await;
+    let outcome = deliver(&mut ends.link, &job(100.0), &mut Memory::default()).await;
     assert_eq!(matches!(outcome, Outcome::Applied(_)), fault.is_none(), "{outcome:?}");
     let text = log.0.lock().unwrap().clone();
     String::from_utf8(text).unwrap()

@@ -5,40 +5,17 @@
 use std::time::Duration;
 
 use benderd::bender::{
-    Bender, Device, Intent, IntentLog, Job, Link, LinkError, LogError, Operation, Outcome, Profile, TableId,
-    Transport, WordOrder, deliver,
+    Bender, Device, Job, Link, LinkError, Operation, Outcome, Profile, TableId, Transport, WordOrder, deliver,
 };
 use benderd::sim::bender::MachineModel;
 use benderd::sim::bender_server::SimulatedBender;
 use benderd::sim::door::Door;
 use benderd::sim::faults::Fault;
 use benderd::sim::frames::Framing;
+use benderd::trial::deliveries::Memory;
 use benderd::tube::{CommandRow, CommandTable};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
-
-/// Keeps what a journal would keep.
-#[derive(Default)]
-struct Memory {
-    intents: Vec<Intent>,
-    outcomes: Vec<Outcome>,
-    full: bool,
-}
-
-impl IntentLog for Memory {
-    fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
-        if self.full {
-            return Err("disk full".into());
-        }
-        self.intents.push(intent.clone());
-        Ok(())
-    }
-
-    fn outcome(&mut self, _: &Job, _: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError> {
-        self.outcomes.push(outcome.clone());
-        Ok(())
-    }
-}
 
 fn profile() -> Profile {
     let mut profile = Profile::load("reference-modbus").unwrap();

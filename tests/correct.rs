@@ -414,6 +414,18 @@ fn rows_of_angle_zero_stay_as_drawn() {
     assert!(split.reasons.iter().any(|r| r.code == Code::Angle && r.bend == Some(4)), "{:?}", split.reasons);
 }
 
+/// Found: what all bends have in common was asked of none.
+#[test]
+fn a_tube_without_a_bend_is_measured_and_kept() {
+    let mut nominal = bracket();
+    nominal.lra = Lra { bends: Vec::new(), last_length_mm: 500.0 };
+    let ask = |parts| step(&nominal, &history(parts), &Knowledge::default(), &Limits::default());
+    let table = ask(vec![]).commanded;
+    assert!(table.bends.is_empty());
+    let answer = ask(vec![part(&table, measured(&nominal.lra, 0.03), "a")]);
+    assert_eq!((answer.verdict, answer.commanded), (Verdict::InTolerance, table));
+}
+
 #[test]
 fn an_earlier_part_that_is_no_tube_is_left_out_and_said() {
     let table = first_table();

@@ -465,12 +465,14 @@ impl Delivery {
         self.look_again(now_ms, format!("the active table is still {}", status.active))
     }
 
+    /// Why the commit was not confirmed, where it was not.
+    fn doubted(&self) -> String {
+        self.doubt.as_ref().map_or(String::new(), |doubt| format!("; when it was sent: {doubt}"))
+    }
+
     /// What else is known of a commit that did nothing.
     fn said(&self, status: &Status) -> String {
-        let mut out = String::new();
-        if let Some(doubt) = &self.doubt {
-            out += &format!("; when it was sent: {doubt}");
-        }
+        let mut out = self.doubted();
         if let Ack::Refused(code) = status.ack
             && status.ack_revision == self.id.revision
         {
@@ -482,11 +484,10 @@ impl Delivery {
     fn look_again(&mut self, now_ms: u64, why: String) -> Action {
         let Deadlines { confirm_ms, poll_ms, .. } = self.profile.deadlines;
         if now_ms.saturating_sub(self.committed_ms) >= confirm_ms {
-            let doubt =
-                self.doubt.as_ref().map_or(String::new(), |doubt| format!("; when it was sent: {doubt}"));
             let why = format!(
-                "{} was committed, and {confirm_ms} ms later it is not known whether it is active: {why}{doubt}",
-                self.id
+                "{} was committed, and {confirm_ms} ms later it is not known whether it is active: {why}{}",
+                self.id,
+                self.doubted()
             );
             return self.finish(Outcome::Unknown { why });
         }

@@ -43,13 +43,11 @@ impl Belief {
     /// For each measurement what the belief and all others let expect of it, with the sigma of finding another: its own noise
     /// included. (The inverse of the whole covariance gives both at once.)
     pub fn leave_one_out(&self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) -> Vec<Known> {
-        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
-        let innovation = DVector::from_column_slice(values) - &h * &self.mean;
-        let spread = &h * &self.covariance * h.transpose() + noise;
-        let Some(inverse) = spread.cholesky().map(|factor| factor.inverse()) else {
+        let surprise = self.surprise(rows, values, noise);
+        let Some(inverse) = surprise.spread.cholesky().map(|factor| factor.inverse()) else {
             return values.iter().map(|&value| Known { value, sigma: f64::INFINITY }).collect();
         };
-        let weighed = &inverse * innovation;
+        let weighed = &inverse * surprise.innovation;
         let one = |(i, value): (usize, &f64)| Known {
             value: value - weighed[i] / inverse[(i, i)],
             sigma: inverse[(i, i)].sqrt().recip(),
@@ -65,13 +63,12 @@ impl Belief {
         values: &[f64],
         noise: &DMatrix<f64>,
     ) -> Option<Known> {
-        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
-        let innovation = DVector::from_column_slice(values) - &h * &self.mean;
+        let surprise = self.surprise(rows, values, noise);
         let per_factor = DVector::from_column_slice(per_factor);
-        let solved = (&h * &self.covariance * h.transpose() + noise).cholesky()?.solve(&per_factor);
+        let solved = surprise.spread.cholesky()?.solve(&per_factor);
         let weight = solved.dot(&per_factor);
-        (weight > 0.0)
-            .then(|| Known { value: solved.dot(&innovation) / weight, sigma: weight.sqrt().recip() })
+        let value = solved.dot(&surprise.innovation) / weight;
+        (weight > 0.0).then(|| Known { value, sigma: weight.sqrt().recip() })
     }
 
     /// Takes measurements in: one row, value each, and the noise's covariance. A noise that leaves nothing to
@@ -80,13 +77,31 @@ impl Belief {
         if rows.is_empty() {
             return;
         }
-        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
-        let innovation = DVector::from_column_slice(values) - &h * &self.mean;
-        let cross = &self.covariance * h.transpose();
-        let Some(factor) = (&h * &cross + noise).cholesky() else { return };
+        let Surprise { cross, innovation, spread } = self.surprise(rows, values, noise);
+        let Some(factor) = spread.cholesky() else { return };
         self.mean += &cross * factor.solve(&innovation);
         self.covariance -= &cross * factor.solve(&cross.transpose());
         // Rounding must not make it lopsided over many parts.
         self.covariance = (&self.covariance + self.covariance.transpose()) * 0.5;
     }
+
+    fn surprise(&self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) -> Surprise {
+        let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
+        let cross = &self.covariance * h.transpose();
+        Surprise {
+            innovation: DVector::from_column_slice(values) - &h * &self.mean,
+            spread: &h * &cross + noise,
+            cross,
+        }
+    }
+}
+
+/// What measurements say beyond the belief.
+struct Surprise {
+    /// Covariance of the unknowns with what is measured.
+    cross: DMatrix<f64>,
+    /// Measured less expected.
+    innovation: DVector<f64>,
+    /// Its covariance.
+    spread: DMatrix<f64>,
 }

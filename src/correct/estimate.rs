@@ -84,11 +84,8 @@ impl Springback {
         let mut unknowns: Vec<Known> = SHAPE.map(|value| Known { value, sigma: SHAPE_SIGMA }).to_vec();
         unknowns.extend(vec![Known { value: 0.0, sigma: RESIDUAL_SIGMA_RAD }; n]);
         let mut belief = Belief::new(&unknowns);
-        for (along, sigma) in [(SHAPE, SCALE_SIGMA), (MIX, MIX_SIGMA)] {
-            let mut direction = DVector::zeros(unknowns.len());
-            direction.rows_mut(0, 3).copy_from_slice(&along);
-            belief.loosen_along(&direction, sigma);
-        }
+        belief.loosen_along(&along(SHAPE, unknowns.len()), SCALE_SIGMA);
+        belief.loosen_along(&along(MIX, unknowns.len()), MIX_SIGMA);
         let mut out = Springback {
             belief,
             s90_rad,
@@ -124,20 +121,21 @@ impl Springback {
     /// Each bend is held against what the others of the same tube say (leave-one-out): that all spring back alike by more than was
     /// expected is news, that one does so alone is doubtful.
     pub fn learn(&mut self, commanded_rad: &[f64], measured: &[Known]) -> Vec<Outlier> {
-        self.belief.loosen_along(&self.along(SHAPE), DRIFT);
-        let found: Vec<f64> = commanded_rad.iter().zip(measured).map(|(c, m)| c - m.value).collect();
-        let mut variances: Vec<f64> =
-            measured.iter().map(|m| BEND_SCATTER_RAD.powi(2) + m.sigma.powi(2)).collect();
-        let rows: Vec<DVector<f64>> =
-            commanded_rad.iter().enumerate().map(|(i, c)| self.row(i, *c)).collect();
+        self.belief.loosen_along(&along(SHAPE, self.belief.len()), DRIFT);
+        let mut seen = Seen {
+            rows: commanded_rad.iter().enumerate().map(|(i, c)| self.row(i, *c)).collect(),
+            found: commanded_rad.iter().zip(measured).map(|(c, m)| c - m.value).collect(),
+            variances: measured.iter().map(|m| BEND_SCATTER_RAD.powi(2) + m.sigma.powi(2)).collect(),
+        };
         for (i, m) in measured.iter().enumerate() {
             self.surprise_sigma_rad[i] = self.measured_at(i, commanded_rad[i], m.sigma).sigma;
         }
-        self.notice_change(&rows, &found, &variances);
-        let (mut heard, mut outliers): (Vec<usize>, Vec<Outlier>) = ((0..found.len()).collect(), Vec::new());
-        let before = std::mem::replace(&mut self.suspect, vec![false; found.len()]);
+        self.notice_change(&seen);
+        let all = || 0..measured.len();
+        let (mut heard, mut outliers): (Vec<usize>, Vec<Outlier>) = (all().collect(), Vec::new());
+        let before = std::mem::replace(&mut self.suspect, vec![false; measured.len()]);
         // One after the other, the worst first: it spoils what the others are held against.
-        while let Some(odd) = self.oddest(&heard, &rows, &found, &variances) {
+        while let Some(odd) = self.oddest(&seen, &heard) {
             let i = odd.bend;
             self.suspect[i] = true;
             heard.retain(|k| *k != i);
@@ -148,85 +146,68 @@ impl Springback {
                 outliers.push(odd);
             }
         }
-        for expected in self.others_say(&heard, &rows, &found, &variances) {
+        for expected in self.others_say(&seen, &heard) {
             let off = expected.off() / DOUBT;
             if off > 1.0 {
-                variances[expected.bend] += expected.expected_rad.sigma.powi(2) * (off.powi(2) - 1.0);
+                seen.variances[expected.bend] += expected.expected_rad.sigma.powi(2) * (off.powi(2) - 1.0);
             }
         }
-        heard.extend((0..found.len()).filter(|&i| self.suspect[i] && before[i]));
-        let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
-        let (values, kept) = (pick(&found), heard.iter().map(|&i| rows[i].clone()).collect::<Vec<_>>());
-        self.belief.update(&kept, &values, &noise(&values, &pick(&variances)));
+        heard.extend(all().filter(|&i| self.suspect[i] && before[i]));
+        let heard = seen.of(&heard);
+        self.belief.update(&heard.rows, &heard.found, &heard.noise());
         outliers
     }
 
     /// Whether all bends together spring back by another factor than they did. Comes first: bends that changed together must not pass for
     /// single ones that are wrong; and those that are, far from the bends' median, have no say.
-    fn notice_change(&mut self, rows: &[DVector<f64>], found: &[f64], variances: &[f64]) {
-        let usual = self.along(SHAPE);
-        let per_factor: Vec<f64> = rows.iter().map(|row| row.dot(&usual)).collect();
-        let off: Vec<f64> =
-            rows.iter().zip(found).map(|(row, found)| found - self.belief.predict(row).value).collect();
-        let mut factors: Vec<f64> = off.iter().zip(&per_factor).map(|(off, per)| off / per).collect();
-        factors.sort_by(f64::total_cmp);
-        let median = 0.5 * (factors[(factors.len() - 1) / 2] + factors[factors.len() / 2]);
+    fn notice_change(&mut self, seen: &Seen) {
+        if seen.rows.is_empty() {
+            return; // a straight tube
+        }
+        let usual = along(SHAPE, self.belief.len());
+        let factor = |row: &DVector<f64>| row.dot(&usual);
+        let off: Vec<f64> = seen
+            .rows
+            .iter()
+            .zip(&seen.found)
+            .map(|(row, found)| found - self.belief.predict(row).value)
+            .collect();
+        let median = median(seen.rows.iter().zip(&off).map(|(row, off)| off / factor(row)).collect());
         let fits = |i: &usize| {
-            let sigma = variances[*i].sqrt().hypot(RESIDUAL_SIGMA_RAD);
-            (off[*i] - median * per_factor[*i]).abs() < REJECT * sigma
+            let sigma = seen.variances[*i].sqrt().hypot(RESIDUAL_SIGMA_RAD);
+            (off[*i] - median * factor(&seen.rows[*i])).abs() < REJECT * sigma
         };
-        let heard: Vec<usize> = (0..found.len()).filter(fits).collect();
-        let pick = |values: &[f64]| heard.iter().map(|&i| values[i]).collect::<Vec<f64>>();
-        let kept: Vec<DVector<f64>> = heard.iter().map(|&i| rows[i].clone()).collect();
-        let noise = noise(&pick(found), &pick(variances));
-        let Some(factor) = self.belief.common_factor(&kept, &pick(&per_factor), &pick(found), &noise) else {
-            return;
-        };
-        let off = factor.value / factor.sigma;
+        let heard = seen.of(&(0..off.len()).filter(fits).collect::<Vec<_>>());
+        let per_factor: Vec<f64> = heard.rows.iter().map(factor).collect();
+        let common = self.belief.common_factor(&heard.rows, &per_factor, &heard.found, &heard.noise());
+        let Some(common) = common else { return };
+        let off = common.value / common.sigma;
         // What nothing was known of before cannot have changed.
         if std::mem::replace(&mut self.has_learned, true) {
             let sum = |before: f64, off: f64| (before + off - CHANGE_LESS).max(0.0);
             self.changed = [sum(self.changed[0], off), sum(self.changed[1], -off)];
         }
         if self.changed.iter().any(|sum| *sum > CHANGE) {
-            self.belief.loosen_along(&usual, factor.value.abs());
+            self.belief.loosen_along(&usual, common.value.abs());
             self.changed = [0.0; 2];
         }
     }
 
-    /// A direction of x among all unknowns.
-    fn along(&self, shape: [f64; 3]) -> DVector<f64> {
-        let mut direction = DVector::zeros(self.belief.len());
-        direction.rows_mut(0, SHAPE.len()).copy_from_slice(&shape);
-        direction
-    }
-
     /// The bend that fits worst to what the others say, if it does not fit at all.
-    fn oddest(
-        &self,
-        heard: &[usize],
-        rows: &[DVector<f64>],
-        found: &[f64],
-        variances: &[f64],
-    ) -> Option<Outlier> {
-        let all = self.others_say(heard, rows, found, variances);
+    fn oddest(&self, seen: &Seen, heard: &[usize]) -> Option<Outlier> {
+        let all = self.others_say(seen, heard);
         all.into_iter().filter(|o| o.off() > REJECT).max_by(|a, b| a.off().total_cmp(&b.off()))
     }
 
     /// For each of these bends what the others let expect, and what was found.
-    fn others_say(
-        &self,
-        heard: &[usize],
-        rows: &[DVector<f64>],
-        found: &[f64],
-        variances: &[f64],
-    ) -> Vec<Outlier> {
-        let values: Vec<f64> = heard.iter().map(|&i| found[i]).collect();
-        let own: Vec<f64> = heard.iter().map(|&i| variances[i]).collect();
-        let picked: Vec<DVector<f64>> = heard.iter().map(|&i| rows[i].clone()).collect();
-        let left_out = self.belief.leave_one_out(&picked, &values, &noise(&values, &own));
-        let one =
-            |(&i, expected_rad): (&usize, Known)| Outlier { bend: i, found_rad: found[i], expected_rad };
+    fn others_say(&self, seen: &Seen, heard: &[usize]) -> Vec<Outlier> {
+        let own = seen.of(heard);
+        let left_out = self.belief.leave_one_out(&own.rows, &own.found, &own.noise());
+        let one = |(&bend, expected_rad): (&usize, Known)| Outlier {
+            bend,
+            found_rad: seen.found[bend],
+            expected_rad,
+        };
         heard.iter().zip(left_out).map(one).collect()
     }
 
@@ -286,11 +267,45 @@ impl Springback {
     }
 }
 
-/// Of a tube's bends: each its own, and what they have in common.
-fn noise(values: &[f64], variances: &[f64]) -> DMatrix<f64> {
-    let mut noise = common_noise(values, TUBE_SCATTER);
-    variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
-    noise
+/// What one tube's bends show.
+struct Seen {
+    /// Of the unknowns.
+    rows: Vec<DVector<f64>>,
+    /// Spring-back.
+    found: Vec<f64>,
+    /// Of each by itself.
+    variances: Vec<f64>,
+}
+
+impl Seen {
+    /// Some of the bends.
+    fn of(&self, bends: &[usize]) -> Seen {
+        Seen {
+            rows: bends.iter().map(|&i| self.rows[i].clone()).collect(),
+            found: bends.iter().map(|&i| self.found[i]).collect(),
+            variances: bends.iter().map(|&i| self.variances[i]).collect(),
+        }
+    }
+
+    /// Each bend's own, and what a tube's bends have in common.
+    fn noise(&self) -> DMatrix<f64> {
+        let mut noise = common_noise(&self.found, TUBE_SCATTER);
+        self.variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
+        noise
+    }
+}
+
+/// A direction of x among all unknowns.
+fn along(shape: [f64; 3], unknowns: usize) -> DVector<f64> {
+    let mut direction = DVector::zeros(unknowns);
+    direction.rows_mut(0, SHAPE.len()).copy_from_slice(&shape);
+    direction
+}
+
+/// Of an even number the middle of the middle two.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
 }
 
 fn common_noise(values: &[f64], share: f64) -> DMatrix<f64> {

@@ -287,19 +287,28 @@ fn trouble(rng: &mut ChaCha8Rng) -> Option<(When, Trouble)> {
     Some((when, trouble))
 }
 
-/// Keeps what a journal would keep.
-#[derive(Default)]
-struct Memory {
-    intents: Vec<Intent>,
+/// Keeps in memory what a journal would keep.
+#[derive(Debug, Default)]
+pub struct Memory {
+    /// In their order.
+    pub intents: Vec<Intent>,
+    /// In theirs.
+    pub outcomes: Vec<Outcome>,
+    /// Takes no intent any more.
+    pub full: bool,
 }
 
 impl IntentLog for Memory {
     fn intent(&mut self, intent: &Intent) -> Result<(), LogError> {
+        if self.full {
+            return Err("disk full".into());
+        }
         self.intents.push(intent.clone());
         Ok(())
     }
 
-    fn outcome(&mut self, _: &Job, _: Option<&Intent>, _: &Outcome) -> Result<(), LogError> {
+    fn outcome(&mut self, _: &Job, _: Option<&Intent>, outcome: &Outcome) -> Result<(), LogError> {
+        self.outcomes.push(outcome.clone());
         Ok(())
     }
 }

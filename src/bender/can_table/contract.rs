@@ -95,9 +95,7 @@ impl Contract {
             },
         })
     }
-}
 
-impl Contract {
     /// The identifiers of all its frames.
     pub fn ids(&self) -> Vec<FrameId> {
         let pairs = [Some(&self.item), Some(&self.commit), self.row.as_ref()];

@@ -34,9 +34,9 @@ pub struct World {
     pub curves: Vec<Arc<Curve>>,
     /// Logarithmic scatter from tube to tube, common to its bends.
     pub tube_sigma: f64,
-    /// Scatter from bend to bend, and what comes to it as a share of the spring-back.
+    /// Scatter from bend to bend.
     pub bend_sigma_rad: f64,
-    /// That share.
+    /// What comes to it as a share of the spring-back.
     pub bend_share: f64,
     /// What a bend of a program is off by, always (one sigma).
     pub residual_sigma_rad: f64,
@@ -64,11 +64,11 @@ impl World {
 pub mod spread {
     use super::DEGREE;
 
-    /// Logarithmic scale of a key.
+    /// Sigma of a key's logarithmic scale.
     pub const KEY: f64 = 0.30;
-    /// Logarithmic scale of a batch: from, to; drawn per key.
+    /// Sigma of a batch's logarithmic scale: from, to; drawn per key.
     pub const BATCH: [f64; 2] = [0.05, 0.12];
-    /// The fixed part of spring-back: median, logarithmic sigma, least, most.
+    /// Median of the fixed part of spring-back.
     pub const FIXED_RAD: f64 = 0.7 * DEGREE;
     /// Its logarithmic sigma.
     pub const FIXED_SIGMA: f64 = 0.4;
@@ -78,9 +78,9 @@ pub mod spread {
     pub const IN_ARC: [f64; 2] = [0.5, 0.8];
     /// Backlash.
     pub const BACKLASH_RAD: [f64; 2] = [0.05 * DEGREE, 0.15 * DEGREE];
-    /// Small errors of the feed; how often the clamp slips, and how far on average.
+    /// Small errors of the feed.
     pub const FEED_MM: f64 = 0.08;
-    /// How often.
+    /// How often the clamp slips.
     pub const SLIP_SHARE: f64 = 0.03;
     /// How far on average.
     pub const SLIP_MM: f64 = 0.6;
@@ -137,15 +137,14 @@ impl Plant {
             backlash_rad: between(&mut rng, spread::BACKLASH_RAD),
             elongation: (0.012 + 0.004 * normal(&mut rng)).max(0.0),
         };
-        let (part, residual_rad) = (part.clone(), Vec::new());
-        let mut plant = Plant { rng, world, part, key, batch_scale: 1.0, residual_rad };
+        let residual_rad = Vec::new();
+        let mut plant = Plant { rng, world, part: part.clone(), key, batch_scale: 1.0, residual_rad };
         if !plant.world.curves.is_empty() {
             let which = plant.rng.random_range(0..plant.world.curves.len());
             plant.key.law = Law::Curve(Arc::clone(&plant.world.curves[which]));
         }
-        let part = plant.part.clone();
         plant.new_batch();
-        plant.new_program(&part);
+        plant.new_program(part);
         plant
     }
 

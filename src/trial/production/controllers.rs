@@ -1,17 +1,15 @@
 //! Who decides on the next table: benderd, the oracle, and what shops do by hand.
 
+use super::oracle::angles::{Angles, Mishaps};
+use super::oracle::feeds::Feeds;
+use super::oracle::turns::Turns;
 use crate::correct::{self, History, Knowledge, Limits, Part, Verdict};
 use crate::inspect;
 use crate::sim::forming::World;
 use crate::tube::{CommandTable, MeasuredTube, Nominal, wrap_angle};
 
-use super::oracle::angles::{Angles, Mishaps};
-use super::oracle::feeds::Feeds;
-use super::oracle::turns::Turns;
-
 /// Which one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Who {
     /// This program.
     Benderd,
@@ -41,8 +39,8 @@ pub struct Scanned {
 pub struct Said {
     /// The next table, or the one in force.
     pub table: CommandTable,
-    /// What only benderd gives: its verdict and its reasons' codes.
-    pub answer: Option<correct::Answer>,
+    /// What only benderd gives.
+    pub verdict: Option<Verdict>,
 }
 
 /// A controller in its job.
@@ -111,7 +109,7 @@ impl Controller for Benderd {
             cut_length_mm: None,
         });
         let answer = self.step();
-        Said { table: answer.commanded.clone(), answer: Some(answer) }
+        Said { table: answer.commanded, verdict: Some(answer.verdict) }
     }
 
     fn new_program(&mut self, part: &Nominal, same_batch: bool) {
@@ -121,11 +119,6 @@ impl Controller for Benderd {
         self.history.batch = Some(format!("batch {}", self.batches));
         self.part = part.clone();
     }
-}
-
-/// Whether benderd wants the same tube scanned again.
-pub fn wants_rescan(said: &Said) -> bool {
-    said.answer.as_ref().is_some_and(|answer| answer.verdict == Verdict::Rescan)
 }
 
 struct Oracle {
@@ -171,7 +164,7 @@ impl Controller for Oracle {
         self.angles.learn(&angles, &seen);
         self.feeds.learn(&fed, &angles, &formed, &distances);
         self.turns.learn(&commanded, &turns);
-        Said { table: self.table(), answer: None }
+        Said { table: self.table(), verdict: None }
     }
 
     fn new_program(&mut self, part: &Nominal, same_batch: bool) {
@@ -210,7 +203,7 @@ impl Controller for ByHand {
                 row.rotation_rad = correct(row.rotation_rad, wrap_angle(wanted.rotation_rad - found));
             }
         }
-        Said { table, answer: None }
+        Said { table, verdict: None }
     }
 
     fn new_program(&mut self, part: &Nominal, _: bool) {

@@ -4,7 +4,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::controllers::{Controller, Said, Scanned, Who, wants_rescan};
+use super::controllers::{Controller, Said, Scanned, Who};
 use super::oracle::angles::Mishaps;
 use super::scanner::Scanner;
 use super::truth::Truth;
@@ -147,23 +147,22 @@ impl<'a> Job<'a> {
         let truth = Truth::of(&formed.lra, part);
         let mut said = self.take(self.scan(&formed, part, 0), 0);
         let mut scans = 1;
-        while wants_rescan(&said) && scans < SCANS {
+        while said.verdict == Some(Verdict::Rescan) && scans < SCANS {
             said = self.take(self.scan(&formed, part, scans), scans);
             scans += 1;
         }
-        let verdict = said.answer.as_ref().map(|answer| answer.verdict);
         self.put(said.table);
-        Tube { truth, good: truth.is_good(part), verdict, scans }
+        Tube { truth, good: truth.is_good(part), verdict: said.verdict, scans }
     }
 
     /// Bends a tube with the table in force.
-    pub fn bend(&mut self, part: &Nominal) -> FormedTube {
+    fn bend(&mut self, part: &Nominal) -> FormedTube {
         self.bent += 1;
         self.plant.bend(&self.table, part.lra.developed_length_mm())
     }
 
     /// Scans the tube that was bent last.
-    pub fn scan(&self, formed: &FormedTube, part: &Nominal, again: usize) -> MeasuredTube {
+    fn scan(&self, formed: &FormedTube, part: &Nominal, again: usize) -> MeasuredTube {
         let stream = self.bent * SCANS as u64 + again as u64;
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x5ca9_0000);
         rng.set_stream(stream);
@@ -179,13 +178,13 @@ impl<'a> Job<'a> {
     }
 
     /// Shows a scan of the tube that was bent last.
-    pub fn take(&mut self, measured: MeasuredTube, again: usize) -> Said {
+    fn take(&mut self, measured: MeasuredTube, again: usize) -> Said {
         let scan_id = format!("{}-{}-{again}", self.seed, self.bent);
         let (commanded, revision) = (self.table.clone(), self.revision);
         self.controller.next(Scanned { commanded, measured, revision, scan_id })
     }
 
-    /// Puts a table in force.
+    /// Puts a table in force, whoever made it.
     pub fn put(&mut self, table: CommandTable) {
         if table != self.table {
             self.revision += 1;

@@ -1,12 +1,17 @@
 //! The lines of the campaign, and their figures.
 
+use std::ops::Range;
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 use super::controllers::Who;
 use super::job::{Scenario, Shop, Tube};
 use super::parts::{Stock, part};
+use super::scanner::Scanner;
+use crate::correct::Verdict;
 use crate::sim::forming::World;
-use crate::trial::production::scanner::Scanner;
+use crate::sim::forming::curves::Curve;
 use crate::tube::Material;
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
@@ -26,11 +31,9 @@ pub struct Line {
     pub length_mm: Option<f64>,
 }
 
-/// What became of the tubes with one number (from 0) in all jobs.
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+/// What became of the tubes with some numbers in all jobs.
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Figures {
-    /// Tubes.
-    pub tubes: usize,
     /// Percent with all angles within 0.3 degrees.
     pub within_03: f64,
     /// The same within 0.5.
@@ -41,15 +44,15 @@ pub struct Figures {
     pub envelope_1: f64,
     /// Percent good by the part's tolerance.
     pub good: f64,
-    /// Medians.
+    /// Median of the tubes' median errors of the distances between corners.
     pub length_mm: f64,
-    /// Of the farthest check points.
+    /// Median of their farthest check points.
     pub envelope_mm: f64,
-    /// Percent that benderd called good, held, wanted scanned again to the end.
+    /// Percent that benderd called good.
     pub called_good: f64,
-    /// Held.
+    /// Percent that it held.
     pub held: f64,
-    /// Scanned again.
+    /// Percent that it wanted to see again, once at least.
     pub scanned_again: f64,
 }
 
@@ -69,7 +72,7 @@ impl Line {
     }
 
     /// What is told of its tubes: which, counted from 1, and the same from 0.
-    pub fn told(&self) -> Vec<(String, std::ops::Range<usize>)> {
+    pub fn told(&self) -> Vec<(String, Range<usize>)> {
         let one = |number: usize| (number.to_string(), number - 1..number);
         match self.shop.scenario {
             Scenario::Cold => (2..=self.shop.parts).map(one).collect(),
@@ -81,13 +84,13 @@ impl Line {
     }
 
     /// Curves are of one tube and die each.
-    fn curves_of(&self, stock: Stock) -> Vec<std::sync::Arc<crate::sim::forming::curves::Curve>> {
+    fn curves_of(&self, stock: Stock) -> Vec<Arc<Curve>> {
         self.shop.world.curves.iter().filter(|curve| Stock::of(curve) == stock).cloned().collect()
     }
 }
 
-/// The figures of tube `number` over all jobs.
-pub fn figures(jobs: &[Vec<Tube>], numbers: std::ops::Range<usize>) -> Figures {
+/// The figures of these tubes (from 0) over all jobs.
+pub fn figures(jobs: &[Vec<Tube>], numbers: Range<usize>) -> Figures {
     let tubes: Vec<&Tube> = jobs.iter().flat_map(|job| &job[numbers.clone()]).collect();
     let count = tubes.len();
     let share = |is: &dyn Fn(&Tube) -> bool| {
@@ -99,9 +102,7 @@ pub fn figures(jobs: &[Vec<Tube>], numbers: std::ops::Range<usize>) -> Figures {
         values.get(count / 2).copied().unwrap_or(0.0)
     };
     let is = |wanted| move |t: &Tube| t.verdict == Some(wanted);
-    use crate::correct::Verdict;
     Figures {
-        tubes: count,
         within_03: share(&|t| t.truth.angle_rad <= 0.3 * DEGREE),
         within_05: share(&|t| t.truth.angle_rad <= 0.5 * DEGREE),
         lateral_1: share(&|t| t.truth.lateral_mm <= 1.0),

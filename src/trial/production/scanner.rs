@@ -55,9 +55,9 @@ impl Scanner {
                 }
             })
             .collect();
-        let true_mm = marks(&tube.bends, |i| tube.bends[i].angle_rad < limit, |j| straight(tube, j));
-        let seen: Vec<f64> = true_mm.iter().map(|mm| mm + draw(self.distance_mm)).collect();
         let corner = |i: usize| tube.bends[i].angle_rad < limit;
+        let true_mm = marks(&tube.bends, corner, |j| straight(tube, j));
+        let seen: Vec<f64> = true_mm.iter().map(|mm| mm + draw(self.distance_mm)).collect();
         let found: Vec<Bend> = bends.iter().map(as_bend).collect();
         let tangents = marks(&found, corner, |_| 0.0);
         let n = bends.len();
@@ -101,10 +101,50 @@ fn straight(tube: &Lra, j: usize) -> f64 {
 }
 
 /// Lengths from mark to mark: a bend's corner, or its tangent point where it has none.
-pub fn marks(bends: &[Bend], corner: impl Fn(usize) -> bool, length_mm: impl Fn(usize) -> f64) -> Vec<f64> {
+fn marks(bends: &[Bend], corner: impl Fn(usize) -> bool, length_mm: impl Fn(usize) -> f64) -> Vec<f64> {
     let tangent = |i: usize| {
         if corner(i) { bends[i].radius_mm * (bends[i].angle_rad / 2.0).tan() } else { 0.0 }
     };
     let sides = |j: usize| [j.checked_sub(1), (j < bends.len()).then_some(j)].into_iter().flatten();
     (0..=bends.len()).map(|j| length_mm(j) + sides(j).map(tangent).sum::<f64>()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+
+    /// Errors over their sigmas are of size 1; lengths are off by what keeps the corners in place.
+    #[test]
+    fn errors_are_as_large_as_they_are_said_to_be() {
+        let bend = |length_mm, angle: f64| Bend {
+            length_mm,
+            rotation_rad: 0.5,
+            angle_rad: angle.to_radians(),
+            radius_mm: 50.0,
+        };
+        let tube =
+            Lra { bends: vec![bend(100.0, 90.0), bend(80.0, 20.0), bend(60.0, 120.0)], last_length_mm: 70.0 };
+        let corners = tube.intersection_distances_mm(MeasuredTube::INTERSECTION_LIMIT_RAD);
+        let (scanner, mut rng) = (Scanner::good(), ChaCha8Rng::seed_from_u64(1));
+        let (mut angle, mut turn, mut distance, mut length) = (0.0, 0.0, 0.0, 0.0);
+        const SCANS: u32 = 2000;
+        for _ in 0..SCANS {
+            let seen = scanner.scan(&tube, 12.7, &mut rng);
+            let b = &seen.bends[1];
+            angle += ((b.angle_rad - tube.bends[1].angle_rad) / b.angle_sigma_rad).powi(2);
+            turn += ((b.rotation_rad.unwrap() - 0.5) / b.rotation_sigma_rad.unwrap()).powi(2);
+            distance += ((seen.intersection_mm[1].unwrap() - corners[1].unwrap()) / 0.04).powi(2);
+            length += (b.length_mm.unwrap() - 80.0).powi(2);
+            let tangent = |i: usize| seen.bends[i].radius_mm.unwrap() * (seen.bends[i].angle_rad / 2.0).tan();
+            let by_length = b.length_mm.unwrap() + tangent(0) + tangent(1);
+            assert!((by_length - seen.intersection_mm[1].unwrap()).abs() < 1e-9);
+        }
+        for (what, sum) in [("angle", angle), ("turn", turn), ("distance", distance)] {
+            let size = (sum / f64::from(SCANS)).sqrt();
+            assert!((0.95..1.05).contains(&size), "{what}: {size}");
+        }
+        assert!((length / f64::from(SCANS)).sqrt() > 0.2, "CLRs are off by 0.3 mm, and lengths with them");
+    }
 }

@@ -4,13 +4,11 @@ use crate::inspect::{self, PointDeviation};
 use crate::tube::{Lra, MeasuredTube, Nominal};
 
 /// How far one tube is off.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Truth {
     /// Largest error of an angle.
     pub angle_rad: f64,
-    /// Largest error of a distance between corners.
-    pub length_mm: f64,
-    /// The median one.
+    /// Median error of the distances between corners.
     pub median_length_mm: f64,
     /// Farthest check point, all of them.
     pub envelope_mm: f64,
@@ -37,7 +35,6 @@ impl Truth {
         let none = if points.is_empty() { f64::INFINITY } else { 0.0 };
         Truth {
             angle_rad,
-            length_mm: lengths.last().copied().unwrap_or(0.0),
             median_length_mm: lengths.get(lengths.len() / 2).copied().unwrap_or(0.0),
             envelope_mm: points.iter().map(|p| p.deviation_mm).fold(none, f64::max),
             lateral_mm: points.iter().map(lateral).fold(none, f64::max),
@@ -64,4 +61,29 @@ fn trimmed(tube: &Lra, wanted: &Lra) -> Lra {
         out.last_length_mm = wanted.last_length_mm;
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Document, Materials, parse_part};
+
+    #[test]
+    fn a_tube_as_drawn_is_off_by_nothing_and_another_by_what_it_is() {
+        let text = include_str!("../../../config/parts/bracket-17.toml");
+        let nominal = parse_part(&Document::new("p.toml", text), &Materials::shipped().unwrap()).unwrap();
+        let as_drawn = Truth::of(&nominal.lra, &nominal);
+        assert!(as_drawn.angle_rad == 0.0 && as_drawn.envelope_mm < 1e-9 && as_drawn.is_good(&nominal));
+        let mut tube = nominal.lra.clone();
+        tube.last_length_mm += 5.0;
+        assert!(Truth::of(&tube, &nominal).envelope_mm < 1e-9, "the last end is the cut's");
+        tube.bends[1].length_mm += 0.6;
+        let longer = Truth::of(&tube, &nominal);
+        assert!((0.1..0.6).contains(&longer.envelope_mm) && longer.is_good(&nominal), "{longer:?}");
+        assert!(longer.median_length_mm < 1e-9, "one of four");
+        tube.bends[1].angle_rad += 0.51_f64.to_radians();
+        let bent = Truth::of(&tube, &nominal);
+        assert!((bent.angle_rad.to_degrees() - 0.51).abs() < 1e-9 && !bent.is_good(&nominal), "{bent:?}");
+        assert!(bent.lateral_mm <= bent.envelope_mm && bent.lateral_mm > 0.1, "{bent:?}");
+    }
 }

@@ -8,7 +8,7 @@ pub mod angles;
 pub mod feeds;
 pub mod turns;
 
-/// Weights from logarithms of likelihoods, the largest 1.
+/// Weights from logarithms of likelihoods; together 1.
 fn normalised(logs: &[f64]) -> Vec<f64> {
     let most = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let raw: Vec<f64> = logs.iter().map(|log| (log - most).exp()).collect();
@@ -26,7 +26,7 @@ fn normal_middles(count: usize) -> Vec<f64> {
     (0..count).map(|k| quantile((k as f64 + 0.5) / count as f64)).collect()
 }
 
-/// The normal distribution's quantile, by halving (its integral by Simpson's rule would do, too; this is not hot).
+/// The normal distribution's quantile, by halving: this is not hot.
 fn quantile(share: f64) -> f64 {
     let (mut low, mut high) = (-9.0, 9.0);
     for _ in 0..60 {
@@ -36,7 +36,7 @@ fn quantile(share: f64) -> f64 {
     0.5 * (low + high)
 }
 
-/// Share of a normal distribution below: 0.5 + integral of the density, in 400 steps.
+/// Share of a normal distribution below so many sigmas: the density summed up in 400 steps.
 fn below(sigmas: f64) -> f64 {
     const STEPS: u32 = 400;
     let width = sigmas / f64::from(STEPS);
