@@ -109,7 +109,7 @@ impl Springback {
         };
         let rows: Vec<DVector<f64>> = points.iter().map(row).collect();
         let values: Vec<f64> = points.iter().map(|p| p.springback_rad).collect();
-        let mut noise = common_noise(&values, common);
+        let mut noise = common_noise(&rows, &values, common);
         for (i, p) in points.iter().enumerate() {
             noise[(i, i)] += p.sigma_rad.powi(2) + RESIDUAL_SIGMA_RAD.powi(2);
         }
@@ -289,7 +289,7 @@ impl Seen {
 
     /// Each bend's own, and what a tube's bends have in common.
     fn noise(&self) -> DMatrix<f64> {
-        let mut noise = common_noise(&self.found, TUBE_SCATTER);
+        let mut noise = common_noise(&self.rows, &self.found, TUBE_SCATTER);
         self.variances.iter().enumerate().for_each(|(i, v)| noise[(i, i)] += v);
         noise
     }
@@ -308,8 +308,16 @@ fn median(mut values: Vec<f64>) -> f64 {
     0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
 }
 
-fn common_noise(values: &[f64], share: f64) -> DMatrix<f64> {
-    let column = DVector::from_column_slice(values) * share;
+/// Of what all bends of a tube have in common: a share of their spring-back. Not of what each was found to be: the fit would
+/// then lean on those that scattered low, and come out below them all (R. W. Peelle's puzzle, 1987).
+fn common_noise(rows: &[DVector<f64>], found: &[f64], share: f64) -> DMatrix<f64> {
+    if rows.is_empty() {
+        return DMatrix::zeros(0, 0);
+    }
+    let usual = along(SHAPE, rows[0].len());
+    let expected: Vec<f64> = rows.iter().map(|row| row.dot(&usual)).collect();
+    let factor = median(found.iter().zip(&expected).map(|(found, expected)| found / expected).collect());
+    let column = DVector::from_vec(expected) * (factor * share);
     &column * column.transpose()
 }
 

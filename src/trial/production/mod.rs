@@ -11,7 +11,7 @@
 pub mod controllers;
 pub mod job;
 pub mod lines;
-mod oracle;
+pub mod oracle;
 pub mod parts;
 pub mod scanner;
 pub mod truth;
