@@ -148,6 +148,7 @@ fn the_chain_from_cloud_to_table_converges() {
                 revision: None,
                 scan_id: Some(part.to_string()),
                 cut_length_mm: None,
+                rescan: false,
             });
             let answer = step(&nominal, &history, &Knowledge::default(), &limits);
             let (angle, point) = (truth.angle_rad.to_degrees(), truth.envelope_mm);

@@ -29,6 +29,7 @@ fn part(commanded: &CommandTable, measured: MeasuredTube, id: &str) -> Part {
         revision: None,
         scan_id: Some(id.into()),
         cut_length_mm: None,
+        rescan: false,
     }
 }
 

@@ -79,6 +79,7 @@ impl Craft for Chain {
             revision: Some(u64::from(p.in_force.id.revision)),
             scan_id: None,
             cut_length_mm: None,
+            rescan: p.rescan,
         };
         let history = History { key: self.key.clone(), batch: None, parts: parts.iter().map(part).collect() };
         let inspection = parts.last().and_then(|p| inspect(&p.measured, &self.nominal).ok());

@@ -12,7 +12,7 @@ use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 use crate::arm::ScanFile;
 use crate::bender::{Operation, TableId};
 use crate::config::Mode;
-use crate::correct::Verdict;
+use crate::correct::{Code, Verdict};
 use crate::tube::{CommandTable, MeasuredTube};
 
 /// Scans in a row that could not be used before a person must look.
@@ -90,6 +90,8 @@ pub struct Part {
     pub in_force: InForce,
     /// What came of it.
     pub measured: MeasuredTube,
+    /// Whether this is another scan of the tube before.
+    pub rescan: bool,
 }
 
 /// One bending cell.
@@ -111,6 +113,8 @@ pub struct Cell {
     /// What this cell delivered last.
     ours: Option<TableId>,
     history: Vec<Part>,
+    /// The last tube is to be scanned again.
+    rescan: bool,
     /// Scans in a row that could not be used.
     unusable: u32,
     /// Attempts to reach the machine in a row that failed.
@@ -132,6 +136,7 @@ impl Cell {
             in_force: None,
             ours: None,
             history: Vec::new(),
+            rescan: false,
             unusable: 0,
             attempts: 0,
         }
@@ -304,6 +309,7 @@ impl Cell {
 
     fn begin_job(&mut self) -> Vec<Action> {
         self.history.clear();
+        self.rescan = false;
         self.unusable = 0;
         self.decide(None)
     }
@@ -354,13 +360,15 @@ impl Cell {
     fn hold(&mut self, reason: String) -> Vec<Action> {
         self.next_ticket();
         self.disarm_after = false;
+        self.rescan = false;
         self.enter(State::Held(reason));
         Vec::new()
     }
 
     fn measured(&mut self, scan: ScanFile, measured: MeasuredTube) -> Vec<Action> {
+        let rescan = std::mem::take(&mut self.rescan);
         if let Some(in_force) = self.in_force.clone() {
-            self.history.push(Part { in_force, measured });
+            self.history.push(Part { in_force, measured, rescan });
         }
         if self.history.len() > MAX_HISTORY {
             self.history.remove(0);
@@ -383,11 +391,17 @@ impl Cell {
     fn decided(&mut self, scan: Option<ScanFile>, decision: Decision) -> Vec<Action> {
         match (decision.answer.verdict, scan) {
             (Verdict::Rescan, Some(scan)) => {
-                self.history.pop();
+                // The next scan is of the same tube: together they may tell.
+                self.rescan = !self.history.is_empty();
                 self.unusable(scan, decision.reasons())
             }
             (Verdict::Hold, Some(scan)) => {
-                self.history.pop();
+                if decision.answer.is_about(Code::BatchChanged) {
+                    // Whoever arms again has approved it: this tube is the new batch's first.
+                    self.history.drain(..self.history.len().saturating_sub(1));
+                } else {
+                    self.history.pop();
+                }
                 self.held_by_decision(scan, decision.reasons())
             }
             (Verdict::Hold | Verdict::Rescan, None) => self.hold(decision.reasons()),

@@ -19,6 +19,7 @@ mod run;
 mod selftest;
 mod simulate;
 mod simulate_bender;
+mod simulate_production;
 
 use std::future::Future;
 use std::io::{ErrorKind, Write};

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::Subcommand;
 
-use super::{Outcome, say, simulate_bender};
+use super::{Outcome, say, simulate_bender, simulate_production};
 use crate::cloud::write_scan;
 use crate::config::{Materials, load_part};
 use crate::sim::scan::{Density, Jaws, PointKind, ScanSettings, TubeShape, scan};
@@ -23,6 +23,8 @@ enum Simulator {
     Scan(ScanArgs),
     /// A bender on the link that its profile names (Modbus, a serial line, a folder, CAN), until Ctrl-C.
     Bender(simulate_bender::Args),
+    /// Many jobs of a part, bent, scanned and corrected on simulated benders: how soon tubes are good, what is scrapped.
+    Production(simulate_production::Args),
 }
 
 #[derive(Debug, clap::Args)]
@@ -83,6 +85,7 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
     match &args.simulator {
         Simulator::Scan(args) => simulate_scan(args),
         Simulator::Bender(args) => simulate_bender::run(args),
+        Simulator::Production(args) => simulate_production::run(args),
     }
 }
 

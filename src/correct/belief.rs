@@ -85,6 +85,17 @@ impl Belief {
         self.covariance = (&self.covariance + self.covariance.transpose()) * 0.5;
     }
 
+    /// The normal distribution with mean and covariance of a mixture: this one, or the other with this chance.
+    pub fn mixed(&self, other: &Belief, chance: f64) -> Belief {
+        let apart = &other.mean - &self.mean;
+        Belief {
+            mean: &self.mean + &apart * chance,
+            covariance: &self.covariance * (1.0 - chance)
+                + &other.covariance * chance
+                + &apart * apart.transpose() * (chance * (1.0 - chance)),
+        }
+    }
+
     fn surprise(&self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) -> Surprise {
         let h = DMatrix::from_fn(rows.len(), self.len(), |i, k| rows[i][k]);
         let cross = &self.covariance * h.transpose();

@@ -30,11 +30,10 @@ const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
 /// Scatter from tube to tube, common to its bends, as a share of the spring-back.
 const TUBE_SCATTER: f64 = 0.015;
 /// Drift of all of x together from part to part: without it the filter stays stuck after a change of material.
-const DRIFT: f64 = 0.01;
-/// A change of all bends together that is more than drift: the sum of what each part was off, in sigmas and less by this each time
-/// (E. S. Page's cumulative sum, 1954), up to that. Then all of x is open again.
-const CHANGE_LESS: f64 = 0.8;
-const CHANGE: f64 = 2.0;
+const DRIFT: f64 = 0.004;
+/// Another batch in the machine, unannounced: how likely that is before any part, and by how much (one sigma) all of x moves then.
+const CHANGE_CHANCE: f64 = 0.12;
+const CHANGE_SIGMA: f64 = 0.10;
 /// Common scale of another job's spring-back: of the same batch, of another or an unknown one.
 const SAME_BATCH: f64 = 0.02;
 const OTHER_BATCH: f64 = 0.10;
@@ -54,8 +53,17 @@ pub struct Springback {
     surprise_sigma_rad: Vec<f64>,
     /// Whether a part of this job was learned from.
     has_learned: bool,
-    /// Sums of how far all bends together were off, upwards and downwards.
-    changed: [f64; 2],
+    /// The tubes' change that the last part speaks for, if any.
+    change: Option<Change>,
+}
+
+/// All bends of a tube spring back by another factor than they did: another batch, or another set-up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Change {
+    /// How likely that is, 0 to 1.
+    pub chance: f64,
+    /// By which share of the spring-back, with its sigma.
+    pub by: Known,
 }
 
 /// A measured angle that does not fit what the job showed before.
@@ -92,7 +100,7 @@ impl Springback {
             suspect: vec![false; n],
             surprise_sigma_rad: vec![0.0; n],
             has_learned: false,
-            changed: [0.0; 2],
+            change: None,
         };
         for record in records {
             let same = batch.is_some() && record.batch.as_deref() == batch;
@@ -116,11 +124,11 @@ impl Springback {
         self.belief.update(&rows, &values, &noise);
     }
 
-    /// Takes in one part: commanded and measured angle per bend. Answers with what was rejected.
+    /// Takes in one part: commanded and measured angle per bend, and how many scans agree on it. Answers with what was rejected.
     ///
     /// Each bend is held against what the others of the same tube say (leave-one-out): that all spring back alike by more than was
     /// expected is news, that one does so alone is doubtful.
-    pub fn learn(&mut self, commanded_rad: &[f64], measured: &[Known]) -> Vec<Outlier> {
+    pub fn learn(&mut self, commanded_rad: &[f64], measured: &[Known], agreed: &[usize]) -> Vec<Outlier> {
         self.belief.loosen_along(&along(SHAPE, self.belief.len()), DRIFT);
         let mut seen = Seen {
             rows: commanded_rad.iter().enumerate().map(|(i, c)| self.row(i, *c)).collect(),
@@ -130,18 +138,24 @@ impl Springback {
         for (i, m) in measured.iter().enumerate() {
             self.surprise_sigma_rad[i] = self.measured_at(i, commanded_rad[i], m.sigma).sigma;
         }
-        self.notice_change(&seen);
+        self.change = self.change_seen(&seen);
+        let chance = self.change.map_or(0.0, |change| change.chance);
+        let (settled, open) = (self.belief.clone(), self.opened(1.0));
+        // Bends are held against each other under what is likely of both.
+        self.belief = self.opened(chance);
         let all = || 0..measured.len();
-        let (mut heard, mut outliers): (Vec<usize>, Vec<Outlier>) = (all().collect(), Vec::new());
-        let before = std::mem::replace(&mut self.suspect, vec![false; measured.len()]);
+        let (mut heard, mut outliers, mut loose): (Vec<usize>, Vec<Outlier>, Vec<(usize, f64)>) =
+            (all().collect(), Vec::new(), Vec::new());
+        let mut before = std::mem::replace(&mut self.suspect, vec![false; measured.len()]);
+        before.iter_mut().zip(agreed).for_each(|(before, scans)| *before |= *scans > 1);
         // One after the other, the worst first: it spoils what the others are held against.
         while let Some(odd) = self.oddest(&seen, &heard) {
             let i = odd.bend;
             self.suspect[i] = true;
             heard.retain(|k| *k != i);
             if before[i] {
-                // Twice in a row is no outlier: this bend has changed.
-                self.belief.loosen(SHAPE.len() + i, odd.found_rad - odd.expected_rad.value);
+                // Twice, in two tubes or two scans, is no outlier: this bend has changed.
+                loose.push((SHAPE.len() + i, odd.found_rad - odd.expected_rad.value));
             } else {
                 outliers.push(odd);
             }
@@ -154,15 +168,29 @@ impl Springback {
         }
         heard.extend(all().filter(|&i| self.suspect[i] && before[i]));
         let heard = seen.of(&heard);
-        self.belief.update(&heard.rows, &heard.found, &heard.noise());
+        let updated = |mut belief: Belief| {
+            loose.iter().for_each(|(index, sigma)| belief.loosen(*index, *sigma));
+            belief.update(&heard.rows, &heard.found, &heard.noise());
+            belief
+        };
+        self.belief = updated(settled).mixed(&updated(open), chance);
         outliers
     }
 
-    /// Whether all bends together spring back by another factor than they did. Comes first: bends that changed together must not pass for
-    /// single ones that are wrong; and those that are, far from the bends' median, have no say.
-    fn notice_change(&mut self, seen: &Seen) {
-        if seen.rows.is_empty() {
-            return; // a straight tube
+    /// The belief if all of x had moved by [`CHANGE_SIGMA`], or with some chance has.
+    fn opened(&self, chance: f64) -> Belief {
+        let mut belief = self.belief.clone();
+        belief.loosen_along(&along(SHAPE, belief.len()), CHANGE_SIGMA * chance.sqrt());
+        belief
+    }
+
+    /// Whether all bends together spring back by another factor than they did: both possibilities are weighed by what they make of
+    /// this part (G. A. Ackerson and K. S. Fu 1970). Comes first: bends that changed together must not pass for single ones that are
+    /// wrong; and those that are, far from the bends' median, have no say. None where nothing was known that could have changed.
+    fn change_seen(&mut self, seen: &Seen) -> Option<Change> {
+        let knew = std::mem::replace(&mut self.has_learned, true);
+        if seen.rows.is_empty() || !knew {
+            return None; // a straight tube, or the first one
         }
         let usual = along(SHAPE, self.belief.len());
         let factor = |row: &DVector<f64>| row.dot(&usual);
@@ -179,18 +207,27 @@ impl Springback {
         };
         let heard = seen.of(&(0..off.len()).filter(fits).collect::<Vec<_>>());
         let per_factor: Vec<f64> = heard.rows.iter().map(factor).collect();
-        let common = self.belief.common_factor(&heard.rows, &per_factor, &heard.found, &heard.noise());
-        let Some(common) = common else { return };
-        let off = common.value / common.sigma;
-        // What nothing was known of before cannot have changed.
-        if std::mem::replace(&mut self.has_learned, true) {
-            let sum = |before: f64, off: f64| (before + off - CHANGE_LESS).max(0.0);
-            self.changed = [sum(self.changed[0], off), sum(self.changed[1], -off)];
-        }
-        if self.changed.iter().any(|sum| *sum > CHANGE) {
-            self.belief.loosen_along(&usual, common.value.abs());
-            self.changed = [0.0; 2];
-        }
+        let common = self.belief.common_factor(&heard.rows, &per_factor, &heard.found, &heard.noise())?;
+        let density = |sigma: f64| (-0.5 * (common.value / sigma).powi(2)).exp() / sigma;
+        let (changed, same) = (
+            CHANGE_CHANCE * density(common.sigma.hypot(CHANGE_SIGMA)),
+            (1.0 - CHANGE_CHANCE) * density(common.sigma),
+        );
+        let by = self.as_share(common);
+        Some(Change { chance: changed / (changed + same), by })
+    }
+
+    /// Of the usual spring-back, as a share of the one believed.
+    fn as_share(&self, of_usual: Known) -> Known {
+        let usual = along(SHAPE, self.belief.len());
+        let scale = self.belief.predict(&usual).value / usual.dot(&usual);
+        let size = scale.abs().max(0.1);
+        Known { value: of_usual.value / size, sigma: of_usual.sigma / size }
+    }
+
+    /// What the last part says of a change of all bends together.
+    pub fn change(&self) -> Option<Change> {
+        self.change
     }
 
     /// The bend that fits worst to what the others say, if it does not fit at all.

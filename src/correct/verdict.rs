@@ -30,6 +30,10 @@ pub enum Code {
     SameScan,
     /// The commanded table is not this part's.
     Program,
+    /// The tube was bent with another revision of the table than it is said to be.
+    Revision,
+    /// All bends spring back by another factor than before.
+    BatchChanged,
     /// The scan shows another number of bends.
     BendCount,
     /// The mirror image fits better.
@@ -42,8 +46,10 @@ pub enum Code {
     TooUncertain,
     /// A bend that does not fit what it did before.
     Outlier,
-    /// Check points were not measured.
+    /// Check points were not measured, or not well enough: another scan can tell.
     Unseen,
+    /// Neither shown to be good nor to be bad, and another scan would not change that.
+    Unproven,
     /// An angle changes.
     Angle,
     /// A feed changes.
@@ -107,4 +113,11 @@ pub struct Answer {
     pub springback_sigma_deg: Vec<f64>,
     /// Why.
     pub reasons: Vec<Reason>,
+}
+
+impl Answer {
+    /// Whether one of the reasons has this code.
+    pub fn is_about(&self, code: Code) -> bool {
+        self.reasons.iter().any(|reason| reason.code == code)
+    }
 }

@@ -98,6 +98,13 @@ pub struct Inspection {
     pub notes: Vec<String>,
 }
 
+impl Inspection {
+    /// Whether every check point was measured.
+    pub fn is_whole(&self) -> bool {
+        self.points.len() == 3 * (self.bends.len() + 1)
+    }
+}
+
 /// Says so when the tube measured is not of the part's diameter.
 pub fn other_diameter(measured: &MeasuredTube, nominal: &Nominal) -> Option<String> {
     let (found, wanted) = (2.0 * measured.tube_radius_mm, nominal.od_mm);
@@ -138,7 +145,7 @@ pub fn inspect(measured: &MeasuredTube, nominal: &Nominal) -> Result<Inspection,
         let note = "the tube fits nearly as well from its other end: mark the first end when scanning";
         out.notes.push(note.to_owned());
     }
-    let verdict = verdict(&out, wanted.bends.len());
+    let verdict = verdict(&out);
     Ok(decided(out, verdict))
 }
 
@@ -277,15 +284,14 @@ fn points(out: &mut Inspection, layout: &Layout, wanted: &Lra, nominal: &Nominal
     }
 }
 
-fn verdict(inspection: &Inspection, bends: usize) -> Verdict {
+fn verdict(inspection: &Inspection) -> Verdict {
     let points = inspection.points.iter().map(|p| p.state);
     let angles = inspection.bends.iter().filter_map(|b| b.angle_deg.state);
     let others = lengths_and_turns(inspection).filter_map(|(_, c)| c.state).filter(|s| *s == State::Out);
     let states: Vec<State> = points.chain(angles).chain(others).collect();
-    let all_points = inspection.points.len() == 3 * (bends + 1);
     if states.contains(&State::Out) {
         Verdict::OutOfTolerance
-    } else if states.contains(&State::Uncertain) || !all_points {
+    } else if states.contains(&State::Uncertain) || !inspection.is_whole() {
         Verdict::Uncertain
     } else {
         Verdict::InTolerance

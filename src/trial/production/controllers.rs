@@ -32,6 +32,8 @@ pub struct Scanned {
     pub revision: u64,
     /// Differs from scan to scan.
     pub scan_id: String,
+    /// Whether it is another scan of the same tube.
+    pub rescan: bool,
 }
 
 /// What is said after a scan.
@@ -50,6 +52,9 @@ pub trait Controller {
 
     /// After one more scan.
     fn next(&mut self, scanned: Scanned) -> Said;
+
+    /// The last scan was of something else: somebody has looked.
+    fn withdraw(&mut self) {}
 
     /// Another part on the same set-up, of the same batch or another.
     fn new_program(&mut self, part: &Nominal, same_batch: bool);
@@ -107,9 +112,14 @@ impl Controller for Benderd {
             revision: Some(scanned.revision),
             scan_id: Some(scanned.scan_id),
             cut_length_mm: None,
+            rescan: scanned.rescan,
         });
         let answer = self.step();
         Said { table: answer.commanded, verdict: Some(answer.verdict) }
+    }
+
+    fn withdraw(&mut self) {
+        self.history.parts.pop();
     }
 
     fn new_program(&mut self, part: &Nominal, same_batch: bool) {

@@ -5,14 +5,13 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::controllers::{Controller, Said, Scanned, Who};
+use super::mixups::{GROSS_RAD, MixUp};
 use super::oracle::angles::Mishaps;
 use super::scanner::Scanner;
 use super::truth::Truth;
 use crate::correct::Verdict;
 use crate::sim::forming::{FormedTube, Plant, World};
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
-
-const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
 /// Scans of one tube, at most.
 const SCANS: usize = 3;
@@ -41,6 +40,8 @@ pub enum Scenario {
         /// Share.
         share: f64,
     },
+    /// One thing is mixed up, with one of the tubes after the first.
+    MixUps,
 }
 
 /// Where a job is done.
@@ -67,6 +68,10 @@ pub struct Tube {
     pub verdict: Option<Verdict>,
     /// How often it was scanned.
     pub scans: usize,
+    /// Whether benderd held it though nothing was wrong.
+    pub held_falsely: bool,
+    /// What was mixed up with it, and whether that was met rightly.
+    pub mix_up: Option<(MixUp, bool)>,
 }
 
 /// A job under way.
@@ -77,7 +82,13 @@ pub struct Job<'a> {
     controller: Box<dyn Controller>,
     table: CommandTable,
     revision: u64,
+    /// The table before, and its revision.
+    older: Option<(CommandTable, u64)>,
     bent: u64,
+    /// What was shown last.
+    shown: Option<Scanned>,
+    /// What will be mixed up with which tube, counted from 1.
+    mix_up: Option<(MixUp, u64)>,
 }
 
 impl Shop {
@@ -120,7 +131,14 @@ impl<'a> Job<'a> {
         let plant = Plant::of(shop.world.clone(), part, seed);
         let mut controller = who.begin(&shop.world, part, shop.mishaps());
         let table = controller.first();
-        Job { shop, seed, plant, controller, table, revision: 1, bent: 0 }
+        let mix_up = (shop.scenario == Scenario::MixUps && shop.parts > 1).then(|| {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x313c_0000);
+            let which = MixUp::ALL[rng.random_range(0..MixUp::ALL.len())];
+            let tube = rng.random_range(2..=shop.parts as u64);
+            // The first correction is the one that matters.
+            (which, if which == MixUp::WrongRevision { 2 } else { tube })
+        });
+        Job { shop, seed, plant, controller, table, revision: 1, older: None, bent: 0, shown: None, mix_up }
     }
 
     fn change(&mut self, part: &Nominal, same_batch: bool) {
@@ -145,14 +163,60 @@ impl<'a> Job<'a> {
     pub fn tube(&mut self, part: &Nominal) -> Tube {
         let formed = self.bend(part);
         let truth = Truth::of(&formed.lra, part);
-        let mut said = self.take(self.scan(&formed, part, 0), 0);
+        let possible = |which: &MixUp| *which != MixUp::WrongRevision || self.older.is_some();
+        let due = self.mix_up.filter(|(_, tube)| *tube == self.bent).map(|(which, _)| which);
+        let mix_up = due.filter(possible);
+        let mut met = None;
+        let mut again = 0;
+        let mut said = match mix_up {
+            Some(which) => {
+                let said = self.mixed_up(which, &formed, part);
+                met = said.verdict.map(|verdict| which.is_met_by(verdict));
+                again += 1;
+                if which.is_withdrawn() && said.verdict == Some(Verdict::Hold) {
+                    self.controller.withdraw();
+                    self.take(self.scan(&formed, part, again), again, false)
+                } else {
+                    said
+                }
+            }
+            None => self.take(self.scan(&formed, part, 0), 0, false),
+        };
         let mut scans = 1;
         while said.verdict == Some(Verdict::Rescan) && scans < SCANS {
-            said = self.take(self.scan(&formed, part, scans), scans);
+            again += 1;
+            said = self.take(self.scan(&formed, part, again), again, true);
             scans += 1;
         }
+        let held_falsely = said.verdict == Some(Verdict::Hold) && !self.has_changed();
         self.put(said.table);
-        Tube { truth, good: truth.is_good(part), verdict: said.verdict, scans }
+        let good = truth.is_good(part);
+        Tube { truth, good, verdict: said.verdict, scans, held_falsely, mix_up: mix_up.zip(met) }
+    }
+
+    /// Whether the tubes did change, unannounced: then somebody should look.
+    fn has_changed(&self) -> bool {
+        matches!(self.shop.scenario, Scenario::Shift { at, .. } if self.bent > at as u64)
+    }
+
+    /// Shows what should not be shown.
+    fn mixed_up(&mut self, which: MixUp, formed: &FormedTube, part: &Nominal) -> Said {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x313c_0001);
+        let mut other = super::parts::other(part, self.seed);
+        other.lra.bends.iter_mut().for_each(|b| b.angle_rad *= rng.random_range(0.99..1.01));
+        let lra = match &self.older {
+            Some((table, _)) if which == MixUp::WrongRevision => {
+                self.plant.clone().bend(table, part.lra.developed_length_mm()).lra
+            }
+            _ => which.tube(&formed.lra, &other.lra, &mut rng),
+        };
+        let measured = which.scan(self.scan(&FormedTube { lra, ..formed.clone() }, part, 0), &mut rng);
+        let mut entry = which.entry(self.entry(measured, 0, false), self.shown.as_ref());
+        if let Some((_, revision)) = self.older.as_ref().filter(|_| which == MixUp::WrongRevision) {
+            entry.revision = *revision;
+        }
+        self.shown = Some(entry.clone());
+        self.controller.next(entry)
     }
 
     /// Bends a tube with the table in force.
@@ -163,32 +227,37 @@ impl<'a> Job<'a> {
 
     /// Scans the tube that was bent last.
     fn scan(&self, formed: &FormedTube, part: &Nominal, again: usize) -> MeasuredTube {
-        let stream = self.bent * SCANS as u64 + again as u64;
+        let stream = self.bent * (SCANS as u64 + 2) + again as u64;
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x5ca9_0000);
         rng.set_stream(stream);
         let mut measured = self.shop.scanner.scan(&formed.lra, part.od_mm / 2.0, &mut rng);
         if let Scenario::Gross { share } = self.shop.scenario {
             for bend in &mut measured.bends {
                 let (wrong, more) = (rng.random_bool(share), rng.random_bool(0.5));
-                let off = if more { 3.0 * DEGREE } else { -3.0 * DEGREE };
+                let off = if more { GROSS_RAD } else { -GROSS_RAD };
                 bend.angle_rad = (bend.angle_rad + if wrong { off } else { 0.0 }).max(0.0);
             }
         }
         measured
     }
 
-    /// Shows a scan of the tube that was bent last.
-    fn take(&mut self, measured: MeasuredTube, again: usize) -> Said {
+    /// Shows a scan of the tube that was bent last; `rescan`: another one.
+    fn take(&mut self, measured: MeasuredTube, again: usize, rescan: bool) -> Said {
+        let entry = self.entry(measured, again, rescan);
+        self.shown = Some(entry.clone());
+        self.controller.next(entry)
+    }
+
+    fn entry(&self, measured: MeasuredTube, again: usize, rescan: bool) -> Scanned {
         let scan_id = format!("{}-{}-{again}", self.seed, self.bent);
-        let (commanded, revision) = (self.table.clone(), self.revision);
-        self.controller.next(Scanned { commanded, measured, revision, scan_id })
+        Scanned { commanded: self.table.clone(), measured, revision: self.revision, scan_id, rescan }
     }
 
     /// Puts a table in force, whoever made it.
     pub fn put(&mut self, table: CommandTable) {
         if table != self.table {
+            self.older = Some((std::mem::replace(&mut self.table, table), self.revision));
             self.revision += 1;
-            self.table = table;
         }
     }
 }

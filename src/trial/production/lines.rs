@@ -50,7 +50,7 @@ pub struct Figures {
     pub envelope_mm: f64,
     /// Percent that benderd called good.
     pub called_good: f64,
-    /// Percent that it held.
+    /// Percent that it held though nothing was wrong.
     pub held: f64,
     /// Percent that it wanted to see again, once at least.
     pub scanned_again: f64,
@@ -79,7 +79,9 @@ impl Line {
             Scenario::Known { .. } => (1..=self.shop.parts).map(one).collect(),
             // The first of the new tubes teaches, the next one is what counts.
             Scenario::Shift { at, .. } => [at, at + 1, at + 2].map(one).into(),
-            Scenario::Gross { .. } => vec![(format!("3 to {}", self.shop.parts), 2..self.shop.parts)],
+            Scenario::Gross { .. } | Scenario::MixUps => {
+                vec![(format!("3 to {}", self.shop.parts), 2..self.shop.parts)]
+            }
         }
     }
 
@@ -111,7 +113,7 @@ pub fn figures(jobs: &[Vec<Tube>], numbers: Range<usize>) -> Figures {
         length_mm: median(&|t| t.truth.median_length_mm),
         envelope_mm: median(&|t| t.truth.envelope_mm),
         called_good: share(&is(Verdict::InTolerance)),
-        held: share(&is(Verdict::Hold)),
+        held: share(&|t| t.held_falsely),
         scanned_again: share(&|t| t.scans > 1),
     }
 }
@@ -133,5 +135,6 @@ pub fn of(name: &str, world: &World, material: &Material, stocks: &[Stock]) -> V
         line("batch changes by 10 %", Scenario::Shift { at: 4, factor: 1.1 }, 6, None),
         line("2 % gross errors", Scenario::Gross { share: 0.02 }, 12, None),
         line("2 m tube", Scenario::Cold, 2, Some(2000.0)),
+        line("mix-ups", Scenario::MixUps, 5, None),
     ]
 }

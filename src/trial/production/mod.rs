@@ -5,13 +5,16 @@
 //! job          tube after tube: bent, scanned, corrected
 //! controllers  benderd; by hand; the oracle, which knows the plant's laws
 //! scanner      a scan without a cloud          truth   what a tube really is
-//! parts        parts at random
+//! parts        parts at random              mixups  what goes wrong around a bender
+//! campaign     many jobs of one part, for `benderd simulate production`
 //! ```
 
+pub mod campaign;
 pub mod controllers;
 pub mod job;
 pub mod lines;
-pub mod oracle;
+pub mod mixups;
+mod oracle;
 pub mod parts;
 pub mod scanner;
 pub mod truth;

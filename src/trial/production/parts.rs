@@ -59,3 +59,15 @@ pub fn part(material: &Material, stock: Stock, length_mm: Option<f64>, seed: u64
     let Stock { od_mm, wall_mm, clr_mm } = stock;
     Nominal { name, od_mm, wall_mm, material, die_clr_mm: clr_mm, lra, tolerance }
 }
+
+/// Another part of the same tube on the same die, with as many bends: what may lie on the same bench.
+pub fn other(part: &Nominal, seed: u64) -> Nominal {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x07e4);
+    let mut out = part.clone();
+    for bend in &mut out.lra.bends {
+        bend.length_mm = rng.random_range(60.0..300.0);
+        bend.rotation_rad = rng.random_range(-180.0..180.0) * DEGREE;
+        bend.angle_rad = rng.random_range(15.0..120.0) * DEGREE;
+    }
+    out
+}

@@ -17,8 +17,11 @@ const STEPS: i32 = 130;
 /// Fixed parts that are tried.
 const FIXED: usize = 15;
 
+/// Sizes of a change that are tried.
+const SHIFTS: usize = 15;
+
 /// Possibilities less likely than this are dropped.
-const LEAST: f64 = 1e-7;
+const LEAST: f64 = 1e-6;
 
 /// Gross errors of a scan's angle are so many degrees.
 const GROSS_RAD: f64 = 3.0 * std::f64::consts::PI / 180.0;
@@ -31,7 +34,7 @@ const NOTHING: f64 = 1.0;
 pub struct Mishaps {
     /// Share of angles measured grossly wrong.
     pub gross: f64,
-    /// How likely the tube's scale jumps before a part, and by how much (logarithm, either way).
+    /// How likely the tubes change before a part, once in a job, and by how much (sigma of the logarithm of their scale).
     pub shift: (f64, f64),
 }
 
@@ -40,6 +43,8 @@ struct Node {
     law: usize,
     log_scale: f64,
     scale: f64,
+    /// Whether the tubes have changed.
+    changed: bool,
     weight: f64,
     residual: DVector<f64>,
     covariance: DMatrix<f64>,
@@ -91,6 +96,7 @@ impl Angles {
             law,
             log_scale,
             scale: log_scale.exp(),
+            changed: false,
             weight: weight(law, log_scale),
             residual: DVector::zeros(n),
             covariance: covariance.clone(),
@@ -199,19 +205,21 @@ impl Angles {
     }
 
     fn may_have_shifted(&mut self) {
-        let (chance, by) = self.mishaps.shift;
+        let (chance, sigma) = self.mishaps.shift;
         if chance == 0.0 {
             return;
         }
-        let shifted = |by: f64, share: f64| {
-            move |node: &Node| {
-                let (log_scale, weight) = (node.log_scale + by, node.weight * share);
-                Node { log_scale, scale: log_scale.exp(), weight, ..node.clone() }
+        let before: Vec<&Node> = self.nodes.iter().filter(|node| !node.changed).collect();
+        let shifted = |by: f64| {
+            move |node: &&Node| {
+                let (log_scale, weight) = (node.log_scale + by, node.weight * chance / SHIFTS as f64);
+                Node { log_scale, scale: log_scale.exp(), changed: true, weight, ..(*node).clone() }
             }
         };
-        let either = |by| self.nodes.iter().map(shifted(by, chance / 2.0)).collect::<Vec<_>>();
-        let moved = [either(by), either(-by)].concat();
-        self.nodes.iter_mut().for_each(|node| node.weight *= 1.0 - chance);
+        let each = normal_middles(SHIFTS).into_iter().map(|sigmas| sigma * sigmas);
+        let moved: Vec<Node> =
+            each.flat_map(|by| before.iter().map(shifted(by)).collect::<Vec<_>>()).collect();
+        self.nodes.iter_mut().filter(|node| !node.changed).for_each(|node| node.weight *= 1.0 - chance);
         self.nodes.extend(moved);
     }
 
