@@ -9,6 +9,8 @@ mod correct;
 mod demo;
 mod export;
 mod inspect;
+mod knowledge;
+mod knowledge_text;
 mod plan_objects;
 mod plan_text;
 mod progress;
@@ -57,6 +59,8 @@ enum Command {
     Inspect(inspect::Args),
     /// One step of the correction loop: from what was measured to the next table.
     Correct(correct::Args),
+    /// What was learned of spring-back: lists, shows, draws, takes in, gives out.
+    Knowledge(knowledge::Args),
     /// Converts bending tables between LRA, XYZ and YBC.
     Convert(convert::Args),
     /// Delivers one table to a bender by hand: stage, verify, commit.
@@ -154,6 +158,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Correct(args) => correct::run(&args),
+        Command::Knowledge(args) => knowledge::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Push(args) => push::run(&args),
         Command::Selftest(args) => selftest::run(&args),

@@ -8,6 +8,7 @@ mod daemon;
 mod document;
 mod materials;
 mod part;
+mod springback;
 mod tables;
 
 pub use at::At;
@@ -18,4 +19,5 @@ pub use daemon::{
 pub use document::{ConfigError, Document};
 pub use materials::Materials;
 pub use part::{load_part, parse_part};
+pub use springback::{parse_springback, read_springback};
 pub use tables::{Table, format_table, parse_table, read_table, write_table};

@@ -205,7 +205,7 @@ fn parse_xyz(doc: &Document, header_line: usize, rows: &[Row]) -> Result<Control
     Ok(ControlPolygon { corners: rows.iter().enumerate().map(corner).collect::<Result<_, _>>()? })
 }
 
-fn value_error(
+pub(super) fn value_error(
     doc: &Document,
     line: usize,
     key: &str,

@@ -29,6 +29,11 @@ impl Belief {
         self.mean.len()
     }
 
+    /// One unknown by itself.
+    pub fn unknown(&self, index: usize) -> Known {
+        Known { value: self.mean[index], sigma: self.covariance[(index, index)].max(0.0).sqrt() }
+    }
+
     /// Lets one unknown drift: its variance grows.
     pub fn loosen(&mut self, index: usize, sigma: f64) {
         self.covariance[(index, index)] += sigma * sigma;
@@ -74,13 +79,19 @@ impl Belief {
     /// Takes measurements in: one row, value each, and the noise's covariance. A noise that leaves nothing to
     /// invert (all zero on a settled belief) changes nothing.
     pub fn update(&mut self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) {
+        if let ([row], [value]) = (rows, values) {
+            return self.update_one(row, *value, noise[(0, 0)]);
+        }
         if rows.is_empty() {
             return;
         }
         let Surprise { cross, innovation, spread } = self.surprise(rows, values, noise);
         let Some(factor) = spread.cholesky() else { return };
-        self.mean += &cross * factor.solve(&innovation);
-        self.covariance -= &cross * factor.solve(&cross.transpose());
+        // Both in units of independent measurements, which spares half of the solving.
+        let Some(cross) = factor.l_dirty().solve_lower_triangular(&cross.transpose()) else { return };
+        let Some(innovation) = factor.l_dirty().solve_lower_triangular(&innovation) else { return };
+        self.mean += cross.tr_mul(&innovation);
+        self.covariance -= cross.tr_mul(&cross);
         // Rounding must not make it lopsided over many parts.
         self.covariance = (&self.covariance + self.covariance.transpose()) * 0.5;
     }
@@ -94,6 +105,19 @@ impl Belief {
                 + &other.covariance * chance
                 + &apart * apart.transpose() * (chance * (1.0 - chance)),
         }
+    }
+
+    /// The same for one measurement.
+    fn update_one(&mut self, row: &DVector<f64>, value: f64, noise: f64) {
+        let cross = &self.covariance * row;
+        let spread = row.dot(&cross) + noise;
+        if spread.is_nan() || spread <= 0.0 {
+            return;
+        }
+        let independent = cross / spread.sqrt();
+        let innovation = (value - row.dot(&self.mean)) / spread.sqrt();
+        self.mean.axpy(innovation, &independent, 1.0);
+        self.covariance.ger(-1.0, &independent, &independent, 1.0);
     }
 
     fn surprise(&self, rows: &[DVector<f64>], values: &[f64], noise: &DMatrix<f64>) -> Surprise {
@@ -115,4 +139,28 @@ struct Surprise {
     innovation: DVector<f64>,
     /// Its covariance.
     spread: DMatrix<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The shortcut and the way by matrices say the same; two independent measurements are one after the other.
+    #[test]
+    fn one_after_the_other_is_all_at_once() {
+        let unknowns = [(1.0, 0.5), (-2.0, 0.3), (0.0, 2.0)].map(|(value, sigma)| Known { value, sigma });
+        let rows = [[1.0, 0.5, 0.0], [0.3, -1.0, 2.0]].map(|row| DVector::from_row_slice(&row));
+        let (values, variances) = ([0.7, 1.9], [0.04, 0.25]);
+        let mut together = Belief::new(&unknowns);
+        together.loosen_along(&DVector::from_row_slice(&[1.0, 1.0, -1.0]), 0.4);
+        let mut singly = together.clone();
+        let noise = DMatrix::from_diagonal(&DVector::from_row_slice(&variances));
+        together.update(&rows, &values, &noise);
+        for k in 0..2 {
+            singly.update(&rows[k..=k], &values[k..=k], &DMatrix::from_element(1, 1, variances[k]));
+        }
+        assert!((&together.mean - &singly.mean).norm() < 1e-12);
+        assert!((&together.covariance - &singly.covariance).norm() < 1e-12);
+        assert_eq!(singly.covariance, singly.covariance.transpose());
+    }
 }

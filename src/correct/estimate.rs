@@ -279,6 +279,22 @@ impl Springback {
         self.surprise_sigma_rad[bend]
     }
 
+    /// The same by the law that all bends of the key share, without what is this bend's own.
+    pub fn law_at(&self, bend: usize, commanded_rad: f64) -> Known {
+        let found = self.belief.predict(&self.shape_row(self.s90_rad[bend], commanded_rad));
+        Known { value: found.value.clamp(0.0, commanded_rad.max(0.0)), ..found }
+    }
+
+    /// The law's coefficients x, in units of [`Springback::usual_rad`].
+    pub fn coefficients(&self) -> [Known; 3] {
+        std::array::from_fn(|i| self.belief.unknown(i))
+    }
+
+    /// Usual spring-back of a 90 degree bend: s90 of the law.
+    pub fn usual_rad(&self, bend: usize) -> f64 {
+        self.s90_rad[bend]
+    }
+
     /// Number of bends.
     pub fn bends(&self) -> usize {
         self.s90_rad.len()
@@ -360,7 +376,7 @@ fn common_noise(rows: &[DVector<f64>], found: &[f64], share: f64) -> DMatrix<f64
 
 /// Spring-back of a 90 degree bend: the material's usual one, moved by what the beam formula says of this
 /// radius against the usual one's 2 D.
-fn usual_springback(nominal: &Nominal, radius_mm: f64) -> f64 {
+pub(super) fn usual_springback(nominal: &Nominal, radius_mm: f64) -> f64 {
     let elastic = |radius_mm: f64| {
         90.0 * DEGREE * elastic_share(&nominal.material, nominal.od_mm, nominal.wall_mm, radius_mm)
     };

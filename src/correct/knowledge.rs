@@ -14,7 +14,7 @@ use crate::tube::{Nominal, deg};
 pub const VERSION: u32 = 2;
 
 /// Jobs kept per key; the oldest go first.
-const MAX_JOBS: usize = 200;
+pub const MAX_JOBS: usize = 200;
 
 /// All keys. Its JSON form is the file of `--knowledge`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -70,7 +70,7 @@ pub struct JobRecord {
     pub part: String,
     /// Batch of the material, where known.
     pub batch: Option<String>,
-    /// Tubes behind the points.
+    /// Tubes behind the points; none where a table was told ([`super::import`]).
     pub parts: usize,
     /// One point per bend: the mean over the job's tubes.
     pub bends: Vec<BendPoint>,
@@ -210,7 +210,7 @@ fn turn_point(nominal: &Nominal, used: &[Used], bend: usize) -> Option<TurnPoint
 }
 
 /// Scatter of the single bend around its mean, for weighing.
-const BEND_SCATTER_RAD: f64 = 0.08 * std::f64::consts::PI / 180.0;
+pub(super) const BEND_SCATTER_RAD: f64 = 0.08 * std::f64::consts::PI / 180.0;
 
 /// Mean of some values with common weights 1 / sigma^2.
 struct Mean<const N: usize> {

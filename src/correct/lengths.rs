@@ -133,6 +133,17 @@ impl Lengths {
         self.wanted.bends[straight].length_mm - self.growth(straight, commanded_rad, &formed).value
     }
 
+    /// Share of the spring-back that opens the arc.
+    pub fn share(&self) -> Known {
+        let more = self.belief.unknown(0);
+        Known { value: USUAL_SHARE + more.value, ..more }
+    }
+
+    /// What the arc grows without spring-back, as a share of its radius.
+    pub fn constant_growth(&self) -> Known {
+        self.belief.unknown(1)
+    }
+
     /// Sigma of a straight's innovation when the last part came in.
     pub fn surprise_sigma_mm(&self, straight: usize) -> f64 {
         self.surprise_sigma_mm[straight]

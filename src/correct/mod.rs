@@ -4,11 +4,17 @@
 //! The way through: [`history`] (the contract) -> [`replay`] (turn each scan round, learn from it: [`estimate`]
 //! angles, [`lengths`] feeds, [`rotations`] planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
 //! limits) -> [`verdict`].
+//!
+//! What jobs leave behind is [`knowledge`], on disk by [`store`]; [`import`] puts in what others know, [`learned`] and
+//! [`summary`] say what is believed of a key.
 
 mod belief;
+mod check;
 pub mod estimate;
 pub mod history;
+pub mod import;
 pub mod knowledge;
+pub mod learned;
 pub mod lengths;
 mod mixups;
 pub mod plan;
@@ -17,6 +23,7 @@ pub mod rotations;
 mod rows;
 mod scans;
 pub mod store;
+pub mod summary;
 pub mod verdict;
 
 pub use history::{History, Part, SetUp};
@@ -24,7 +31,7 @@ pub use knowledge::Knowledge;
 pub use plan::Limits;
 pub use verdict::{Answer, Code, Reason, Verdict};
 
-use crate::inspect::{self, Inspection};
+use crate::inspect;
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
@@ -103,14 +110,11 @@ fn first_piece(job: &Job, replay: &Replay) -> Answer {
 fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
     let nominal = job.nominal;
     let in_force = newest.commanded.clone();
-    let seen = |measured: &MeasuredTube| inspect::inspect(measured, nominal);
-    let (whole, inspection) = match (seen(&newest.measured), seen(&trimmed(&newest.measured, nominal))) {
-        (Ok(whole), Ok(trimmed)) => (whole, trimmed),
-        (Err(e), _) | (_, Err(e)) => {
-            return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]);
-        }
+    let inspection = match inspect::inspect(&trimmed(&newest.measured, nominal), nominal) {
+        Ok(inspection) => inspection,
+        Err(e) => return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]),
     };
-    let mut reasons: Vec<Reason> = cut_length(&whole, job).into_iter().collect();
+    let mut reasons: Vec<Reason> = cut_length(&newest.measured, job).into_iter().collect();
     if inspection.verdict == inspect::Verdict::InTolerance {
         return answer(Verdict::InTolerance, in_force, replay, reasons);
     }
@@ -191,8 +195,8 @@ fn trimmed(measured: &MeasuredTube, nominal: &Nominal) -> MeasuredTube {
     out
 }
 
-fn cut_length(whole: &Inspection, job: &Job) -> Option<Reason> {
-    let last = whole.last_length_mm?;
+fn cut_length(whole: &MeasuredTube, job: &Job) -> Option<Reason> {
+    let last = inspect::last_length(whole, job.nominal)?;
     let off = last.deviation?;
     if off.abs() <= job.nominal.tolerance.length_mm {
         return None;

@@ -85,6 +85,11 @@ impl Rotations {
         }
     }
 
+    /// The head's backlash.
+    pub fn backlash(&self) -> Known {
+        self.belief.unknown(0)
+    }
+
     /// The turn to command for a wanted one; the first row has no plane to turn against.
     pub fn command_for(&self, bend: usize, wanted_rad: f64) -> f64 {
         if bend == 0 {

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use thiserror::Error;
 
-use super::Knowledge;
 use super::knowledge::VERSION;
+use super::{Knowledge, check};
 
 /// Why a knowledge file cannot be used.
 #[derive(Debug, Error)]
@@ -40,10 +40,21 @@ pub fn load(path: &Path) -> Result<Knowledge, StoreError> {
     };
     let knowledge: Knowledge = serde_json::from_str(&text)
         .map_err(|e| StoreError::Syntax { file: file.clone(), detail: e.to_string() })?;
-    match knowledge.version {
-        VERSION => Ok(knowledge),
-        other => Err(StoreError::Syntax { file, detail: format!("version = {other}, allowed is {VERSION}") }),
+    let unfit = match knowledge.version {
+        VERSION => check::unfit(&knowledge),
+        other => Some(format!("version = {other}, allowed is {VERSION}")),
+    };
+    match unfit {
+        None => Ok(knowledge),
+        Some(detail) => Err(StoreError::Syntax { file, detail }),
     }
+}
+
+/// The same where the file has to be there.
+pub fn load_present(path: &Path) -> Result<Knowledge, StoreError> {
+    let file = || path.display().to_string();
+    fs::metadata(path).map_err(|source| StoreError::Io { file: file(), source })?;
+    load(path)
 }
 
 /// Writes a knowledge file so that after a power cut there is the old one or the new one: a temporary file in

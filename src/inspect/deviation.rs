@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::laid::{Known, Layout, points_of};
 use crate::tube::align::{Pair, register};
-use crate::tube::{Alignment, Lra};
+use crate::tube::{Alignment, Frame, Lra, Spine};
 
 /// A deviation against its tolerance with a guard band of two sigmas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -90,9 +90,10 @@ pub fn compare(layout: &Layout, nominal: &Lra, alignment: Alignment, envelope_mm
             *c += (p - b) * (p - b).transpose();
         }
     }
+    let spine = Spine::from_lra(nominal, Frame::identity());
     let mut points = Vec::new();
     for (j, places) in known.iter().enumerate() {
-        let direction = direction(nominal, j);
+        let direction = direction(&spine, j);
         for (k, place) in [Place::Start, Place::Middle, Place::End].into_iter().enumerate() {
             if !places[k] {
                 continue;
@@ -153,8 +154,7 @@ fn weights(known: &[[bool; 3]], wanted: &Points, alignment: Alignment) -> Vec<[f
     if weights.iter().flatten().any(|&w| held(w)) { weights } else { vec![[0.0; 3]; known.len()] }
 }
 
-fn direction(nominal: &Lra, straight: usize) -> Vector3<f64> {
-    let spine = crate::tube::Spine::from_lra(nominal, crate::tube::Frame::identity());
+fn direction(spine: &Spine, straight: usize) -> Vector3<f64> {
     spine.segments().get(2 * straight).map_or(Vector3::x(), |s| s.start * Vector3::x())
 }
 

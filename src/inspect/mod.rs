@@ -149,6 +149,20 @@ pub fn inspect(measured: &MeasuredTube, nominal: &Nominal) -> Result<Inspection,
     Ok(decided(out, verdict))
 }
 
+/// The last straight of a tube measured in the nominal's direction, as [`inspect`] has it; None with another number of bends.
+pub fn last_length(measured: &MeasuredTube, nominal: &Nominal) -> Option<Comparison> {
+    let wanted = nominal.lra.merged();
+    let same = measured.bends.len() == wanted.bends.len();
+    same.then(|| last_straight(&Layout::new(measured, &wanted), &wanted, nominal))
+}
+
+fn last_straight(layout: &Layout, wanted: &Lra, nominal: &Nominal) -> Comparison {
+    let known = layout.distance[wanted.bends.len()];
+    let measured = known.map(|_| layout.lra().last_length_mm);
+    let tolerance = Some(nominal.tolerance.length_mm);
+    comparison(wanted.last_length_mm, measured, known.map(|k| k.sigma), tolerance)
+}
+
 /// Refuses values that no tube can have.
 pub fn check(measured: &MeasuredTube) -> Result<(), InspectError> {
     let range = |row, field, value: Option<f64>, min: f64, max: f64, allowed| match value {
@@ -264,7 +278,7 @@ fn rows(out: &mut Inspection, layout: &Layout, turned: &MeasuredTube, wanted: &L
             out.notes.push(format!("rotation {} is not known: points beyond it are left out", i + 1));
         }
     }
-    out.last_length_mm = Some(length(wanted.bends.len(), wanted.last_length_mm, laid.last_length_mm));
+    out.last_length_mm = Some(last_straight(layout, wanted, nominal));
     for (j, _) in layout.distance.iter().enumerate().filter(|(_, d)| d.is_none()) {
         out.notes.push(format!(
             "length of straight {} is not known: points that depend on it are left out",

@@ -12,6 +12,7 @@ mod measured;
 mod nominal;
 mod polygon;
 mod spine;
+mod springback;
 mod table;
 mod ybc;
 
@@ -22,5 +23,6 @@ pub use measured::{Decision, MeasuredBend, MeasuredTube};
 pub use nominal::{Alignment, Nominal, Tolerance};
 pub use polygon::{ControlPolygon, Corner, any_normal};
 pub use spine::{ClosestPoint, Frame, Segment, SegmentKind, Spine, StraightPoints};
+pub use springback::{SpringbackForm, SpringbackTable};
 pub use table::{CommandRow, CommandTable};
 pub use ybc::{Ybc, YbcRow};
