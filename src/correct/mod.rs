@@ -3,29 +3,36 @@
 //! Between `inspect` and `bender`. [`step`] is pure: history and knowledge in, one [`Answer`] out, nothing kept.
 //! The way through: [`history`] (the contract) -> [`replay`] (turn each scan round, learn from it: [`estimate`]
 //! angles, [`lengths`] feeds, [`rotations`] planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
-//! limits) -> [`verdict`].
+//! limits; [`shape`] has the whole tube in view) -> [`predicted`] (what it will bend) -> [`verdict`].
 
 mod belief;
 pub mod estimate;
 pub mod history;
 pub mod knowledge;
 pub mod lengths;
+pub mod next_tube;
 pub mod plan;
+pub mod predicted;
 pub mod replay;
 pub mod rotations;
+pub mod rounding;
 mod rows;
+pub mod shape;
 pub mod store;
 pub mod verdict;
 
 pub use history::{History, Part, SetUp};
 pub use knowledge::Knowledge;
 pub use plan::Limits;
+pub use predicted::{Predicted, PredictedPoint};
 pub use verdict::{Answer, Code, Reason, Verdict};
 
-use crate::inspect::{self, Inspection};
+use crate::inspect::{self, Comparison};
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
+use predicted::foretold;
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
+use shape::{Case, shaped};
 
 /// One step of the loop: what the history says, and the table to bend with next.
 pub fn step(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
@@ -52,13 +59,18 @@ pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits
 /// For tables without rows of angle 0.
 fn step_of_bends(job: &Job) -> Answer {
     let read = replay(job, false);
-    let decided = decide(job, &read);
+    foretold(job, &read, either_way(job, &read))
+}
+
+/// What is decided, unless it depends on from which end the newest part was scanned.
+fn either_way(job: &Job, read: &Replay) -> Answer {
+    let decided = decide(job, read);
     let Newest::Used { ambiguous: true, .. } = read.newest else { return decided };
     let turned = decide(job, &replay(job, true));
     if matters(&decided, &turned, job.nominal) {
         let text = "the scan fits the part from both ends, and the next table depends on which it was: mark the \
                     first end and scan again";
-        return held(job, &read, vec![Reason::new(Code::Direction, text)]);
+        return held(job, read, vec![Reason::new(Code::Direction, text)]);
     }
     decided
 }
@@ -88,6 +100,8 @@ fn first_piece(job: &Job, replay: &Replay) -> Answer {
     if !violations.is_empty() {
         return held(job, replay, violations);
     }
+    let case = Case { model: &replay.model, nominal: job.nominal, newest: None, limits: job.limits };
+    let table = shaped(&case, table);
     answer(Verdict::FirstPiece, table, replay, Vec::new())
 }
 
@@ -95,14 +109,12 @@ fn first_piece(job: &Job, replay: &Replay) -> Answer {
 fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
     let nominal = job.nominal;
     let in_force = newest.commanded.clone();
-    let seen = |measured: &MeasuredTube| inspect::inspect(measured, nominal);
-    let (whole, inspection) = match (seen(&newest.measured), seen(&trimmed(&newest.measured, nominal))) {
-        (Ok(whole), Ok(trimmed)) => (whole, trimmed),
-        (Err(e), _) | (_, Err(e)) => {
-            return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]);
-        }
+    let inspection = match inspect::inspect(&trimmed(&newest.measured, nominal), nominal) {
+        Ok(inspection) => inspection,
+        Err(e) => return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]),
     };
-    let mut reasons: Vec<Reason> = cut_length(&whole, job).into_iter().collect();
+    let last = inspect::last_straight(&newest.measured, nominal);
+    let mut reasons: Vec<Reason> = cut_length(&last, job).into_iter().collect();
     if inspection.verdict == inspect::Verdict::InTolerance {
         return answer(Verdict::InTolerance, in_force, replay, reasons);
     }
@@ -170,8 +182,7 @@ fn trimmed(measured: &MeasuredTube, nominal: &Nominal) -> MeasuredTube {
     out
 }
 
-fn cut_length(whole: &Inspection, job: &Job) -> Option<Reason> {
-    let last = whole.last_length_mm?;
+fn cut_length(last: &Comparison, job: &Job) -> Option<Reason> {
     let off = last.deviation?;
     if off.abs() <= job.nominal.tolerance.length_mm {
         return None;
@@ -229,6 +240,7 @@ fn answer(verdict: Verdict, commanded: CommandTable, replay: &Replay, reasons: V
         verdict,
         springback_deg: next.iter().map(|k| clean(k.value)).collect(),
         springback_sigma_deg: next.iter().map(|k| clean(k.sigma)).collect(),
+        predicted: None,
         commanded,
         reasons: reasons.into_iter().chain(replay.left_out.iter().cloned()).collect(),
     }
