@@ -101,8 +101,8 @@ fn table(answer: &Answer) -> String {
 fn expected(predicted: &Predicted) -> String {
     let Predicted { alignment, envelope_mm, worst, .. } = predicted;
     format!(
-        "expected of the next tube ({alignment}): check points within {:.2} mm ({} of straight {}), ±{:.2} from tube to tube without \
-         slip; allowed {envelope_mm}",
+        "expected of the next tube ({alignment}): check points within {:.2} mm ({} of straight {}), allowed {envelope_mm}; \
+         ±{:.2} mm is not known or scatters, slip not counted",
         worst.deviation_mm, worst.place, worst.straight, worst.sigma_mm
     )
 }

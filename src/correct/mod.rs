@@ -18,7 +18,9 @@ pub mod rotations;
 pub mod rounding;
 mod rows;
 pub mod shape;
+mod steps;
 pub mod store;
+pub mod values;
 pub mod verdict;
 
 pub use history::{History, Part, SetUp};
@@ -96,12 +98,12 @@ fn decide(job: &Job, replay: &Replay) -> Answer {
 fn first_piece(job: &Job, replay: &Replay) -> Answer {
     let mut table = plan::first(&replay.model, job.nominal);
     plan::clamp(&mut table, job.limits);
+    let case = Case { model: &replay.model, nominal: job.nominal, newest: None, limits: job.limits };
+    let table = shaped(&case, table);
     let violations = plan::violations(&table, job.nominal, job.limits);
     if !violations.is_empty() {
         return held(job, replay, violations);
     }
-    let case = Case { model: &replay.model, nominal: job.nominal, newest: None, limits: job.limits };
-    let table = shaped(&case, table);
     answer(Verdict::FirstPiece, table, replay, Vec::new())
 }
 

@@ -4,7 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::next_tube::NextTube;
 use super::replay::{Job, Replay};
-use super::shape::{Case, Value};
+use super::shape::Case;
+use super::values::Value;
 use super::verdict::{Answer, Code, Reason, Verdict};
 use crate::inspect::{Place, check_point};
 use crate::tube::deg::to_degrees_clean;
@@ -99,10 +100,10 @@ fn reasons(case: &Case, table: &CommandTable, tube: &NextTube) -> Vec<Reason> {
     if tube.share(nominal) <= 1.0 {
         return out;
     }
-    let within_limits = case.next_tube_unrounded(table);
+    let within_limits = case.next_tube_within_limits(table);
     if within_limits.is_some_and(|tube| tube.share(nominal) > 1.0) {
         out.push(out_of_reach(case, table, tube));
-    } else {
+    } else if each.share(nominal) > 1.0 {
         let machine = &case.limits.machine;
         let text = format!(
             "{}: the machine's steps of {} mm and {} degrees are too coarse for the tolerance; widen it, or expect to sort tubes \

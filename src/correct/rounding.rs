@@ -44,6 +44,11 @@ impl Choice {
         (if least <= most { wanted.max(least).min(most) } else { middle }) * self.step
     }
 
+    /// Whether there is a value in the range.
+    pub fn has_any(&self) -> bool {
+        self.step <= 0.0 || (self.low..=self.high).contains(&self.nearest(self.low))
+    }
+
     fn is_one(&self) -> bool {
         self.nearest(self.low) == self.nearest(self.high)
     }
