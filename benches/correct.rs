@@ -39,7 +39,14 @@ fn job(nominal: &Nominal, parts: usize, knowledge: &Knowledge, seed: u64) -> His
         let formed = plant.bend(&commanded, nominal.lra.developed_length_mm());
         let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut rng);
         let scan_id = Some(format!("{seed}-{k}"));
-        history.parts.push(Part { commanded, measured, revision: None, scan_id, cut_length_mm: None });
+        history.parts.push(Part {
+            commanded,
+            measured,
+            revision: None,
+            scan_id,
+            cut_length_mm: None,
+            rescan: false,
+        });
     }
     history
 }

@@ -40,7 +40,14 @@ fn main() -> anyhow::Result<()> {
             let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut rng);
             let scan_id = Some(format!("job {number}, tube {}", k + 1));
             let commanded = answer.commanded;
-            history.parts.push(Part { commanded, measured, revision: None, scan_id, cut_length_mm: None });
+            history.parts.push(Part {
+                commanded,
+                measured,
+                revision: None,
+                scan_id,
+                cut_length_mm: None,
+                rescan: false,
+            });
         }
         known = learn(&nominal, &history, &known, &limits);
         plant.new_batch();

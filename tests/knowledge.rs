@@ -91,6 +91,7 @@ fn job(known: &Knowledge, bender: &str, batch: &str, tubes: usize, springback_de
             revision: None,
             scan_id: Some(format!("{bender} {batch} {tube}")),
             cut_length_mm: None,
+            rescan: false,
         });
     }
     learn(&nominal, &history, known, &Limits::default())
