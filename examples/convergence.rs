@@ -36,7 +36,7 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     let materials = Materials::shipped()?;
     let material = |key: &str| materials.get(key).cloned().with_context(|| format!("no material {key}"));
-    let mut all = Vec::new();
+    let (mut all, mut missed) = (Vec::new(), Vec::new());
     for key in ["steel", "304", "ti-3al-2.5v"] {
         all.extend(lines::of("A", &World::plain(), &material(key)?, &[Stock::INCH]));
         all.extend(lines::of("B", &World::believable(), &material(key)?, &[Stock::INCH]));
@@ -47,33 +47,49 @@ fn main() -> anyhow::Result<()> {
         let world = World { curves, ..World::believable() };
         all.extend(lines::of("curves", &world, &material("ti-6al-4v")?, &stocks));
     }
+    let shown: Vec<_> = all.iter().filter(|line| line.name.contains(&args.only)).collect();
     println!(
-        "| line | part | who | 0.3 deg | 0.5 deg | lateral 1 mm | envelope 1 mm | good | length mm | envelope mm | called good | held | scanned again |"
+        "`convergence --jobs {} --seed {}`: benderd / oracle / deadbeat / half gain\n",
+        args.jobs, args.seed
     );
-    println!("| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |");
-    for line in all.iter().filter(|line| line.name.contains(&args.only)) {
-        for who in Who::ALL {
-            let jobs = line.run(who, args.seed, args.jobs);
-            for (name, range) in line.told() {
-                row(&line.name, &name, who, &figures(&jobs, range));
-            }
+    println!("{HEAD}");
+    for line in shown {
+        let jobs = Who::ALL.map(|who| line.run(who, args.seed, args.jobs));
+        for (name, range) in line.told() {
+            row(&line.name, &name, &jobs.each_ref().map(|jobs| figures(jobs, range.clone())));
         }
+        let mixed = || jobs[0].iter().flatten().filter_map(|tube| tube.mix_up);
+        if mixed().count() > 0 {
+            missed.push(format!(
+                "{}: {} of {}",
+                line.name,
+                mixed().filter(|(_, met)| !met).count(),
+                mixed().count()
+            ));
+        }
+    }
+    if !missed.is_empty() {
+        println!("\nMix-ups missed: {}.", missed.join("; "));
     }
     Ok(())
 }
 
-fn row(line: &str, part: &str, who: Who, f: &Figures) {
+const HEAD: &str = "| line | tube | angles 0.3 deg | 0.5 deg | lateral 1 mm | sphere 1 mm | length mm | envelope mm | called good | held falsely | scanned again |
+| --- | --- | --- | --- | --- | --- | --- | --- | --: | --: | --: |";
+
+fn row(line: &str, tube: &str, of: &[Figures; 4]) {
+    let each = |value: &dyn Fn(&Figures) -> String| of.each_ref().map(|f| value(f)).join(" / ");
+    let share = |value: &dyn Fn(&Figures) -> f64| each(&|f| format!("{:.1}", value(f)));
     println!(
-        "| {line} | {part} | {who:?} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.3} | {:.3} | {:.1} | {:.1} | {:.1} |",
-        f.within_03,
-        f.within_05,
-        f.lateral_1,
-        f.envelope_1,
-        f.good,
-        f.length_mm,
-        f.envelope_mm,
-        f.called_good,
-        f.held,
-        f.scanned_again
+        "| {line} | {tube} | {} | {} | {} | {} | {} | {} | {:.1} | {:.2} | {:.1} |",
+        share(&|f| f.within_03),
+        share(&|f| f.within_05),
+        share(&|f| f.lateral_1),
+        share(&|f| f.envelope_1),
+        each(&|f| format!("{:.3}", f.length_mm)),
+        each(&|f| format!("{:.2}", f.envelope_mm)),
+        of[0].called_good,
+        of[0].held,
+        of[0].scanned_again
     );
 }

@@ -82,6 +82,7 @@ fn part(commanded: &CommandTable, tube: &Lra, id: usize) -> Part {
         revision: None,
         scan_id: Some(id.to_string()),
         cut_length_mm: None,
+        rescan: false,
     }
 }
 

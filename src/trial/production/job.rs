@@ -131,7 +131,9 @@ impl<'a> Job<'a> {
         let plant = Plant::of(shop.world.clone(), part, seed);
         let mut controller = who.begin(&shop.world, part, shop.mishaps());
         let table = controller.first();
-        let mix_up = (shop.scenario == Scenario::MixUps && shop.parts > 1).then(|| {
+        // Who gives no verdicts is not shown them: somebody sorts them out.
+        let judges = who == Who::Benderd && shop.parts > 1;
+        let mix_up = (shop.scenario == Scenario::MixUps && judges).then(|| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x313c_0000);
             let which = MixUp::ALL[rng.random_range(0..MixUp::ALL.len())];
             let tube = rng.random_range(2..=shop.parts as u64);
