@@ -47,6 +47,7 @@ fn decision(verdict: Verdict) -> Box<Decision> {
         commanded: table(7.0),
         springback_deg: Vec::new(),
         springback_sigma_deg: Vec::new(),
+        predicted: None,
         reasons: vec![Reason::new(Code::Scatter, "why")],
     };
     Box::new(Decision { answer, inspection: None })

@@ -50,6 +50,7 @@ impl Craft for Script {
             commanded: table(90.0 + parts.len() as f64),
             springback_deg: Vec::new(),
             springback_sigma_deg: Vec::new(),
+            predicted: None,
             reasons: vec![Reason::new(Code::Scatter, "as scripted")],
         };
         Decision { answer, inspection: None }

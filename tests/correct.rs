@@ -574,7 +574,15 @@ fn the_contract_is_driven_by_hand() {
     let first: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert_eq!((code, first["verdict"].as_str()), (Some(0), Some("first_piece")));
     let keys: Vec<&String> = first.as_object().unwrap().keys().collect();
-    assert_eq!(keys, ["commanded", "reasons", "springback_deg", "springback_sigma_deg", "verdict"]);
+    assert_eq!(
+        keys,
+        ["commanded", "predicted", "reasons", "springback_deg", "springback_sigma_deg", "verdict"]
+    );
+    let keys: Vec<&String> = first["predicted"].as_object().unwrap().keys().collect();
+    assert_eq!(keys, ["alignment", "angle_deviation_deg", "envelope_mm", "points", "worst"]);
+    let keys: Vec<&String> = first["predicted"]["worst"].as_object().unwrap().keys().collect();
+    assert_eq!(keys, ["deviation_mm", "place", "sigma_mm", "straight"]);
+    assert_eq!(first["predicted"]["points"].as_array().unwrap().len(), 15);
     let row: Vec<&String> = first["commanded"]["bends"][0].as_object().unwrap().keys().collect();
     assert_eq!(row, ["angle_deg", "length_mm", "rotation_deg"]);
 
@@ -611,6 +619,25 @@ fn the_contract_is_driven_by_hand() {
     let (code, out, _) = run(dir.path(), &history.to_string(), &[]);
     assert_eq!(code, Some(0));
     assert!(out.lines().last().unwrap().starts_with("correct: "), "{out}");
+    assert!(out.contains("expected of the next tube (best-fit): check points within 0."), "{out}");
+}
+
+#[test]
+fn a_bender_named_by_hand_is_kept_to() {
+    let dir = tempfile::tempdir().unwrap();
+    let (code, out, err) = run(dir.path(), r#"{"parts": []}"#, &["--json", "--bender", "ten-row"]);
+    let first: serde_json::Value = serde_json::from_str(&out).unwrap_or_else(|e| panic!("{e}: {out}{err}"));
+    assert_eq!((code, first["verdict"].as_str()), (Some(0), Some("first_piece")));
+    for row in first["commanded"]["bends"].as_array().unwrap() {
+        for value in ["length_mm", "rotation_deg", "angle_deg"] {
+            let value = row[value].as_f64().unwrap();
+            assert!((value - value.round()).abs() < 1e-6, "whole millimetres and degrees: {row}");
+        }
+    }
+    let expected = first["predicted"]["worst"]["deviation_mm"].as_f64().unwrap();
+    assert!((0.01..=1.5).contains(&expected), "rounding shows, and is made the best of: {expected}");
+    let (code, _, err) = run(dir.path(), r#"{"parts": []}"#, &["--bender", "no-such-machine"]);
+    assert!(code == Some(2) && err.contains("no-such-machine"), "{err}");
 }
 
 #[test]

@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use super::{Outcome, say};
+use crate::bender::Profile;
 use crate::config::{Materials, load_part};
-use crate::correct::{Answer, History, Knowledge, Limits, Verdict, learn, step, store};
+use crate::correct::{Answer, History, Knowledge, Limits, Predicted, Verdict, learn, step, store};
+use crate::tube::MachineLimits;
 
 /// Arguments of `benderd correct`.
 #[derive(Debug, clap::Args)]
@@ -20,6 +22,10 @@ pub struct Args {
     /// File of what was learned about spring-back: read, and written back with this job in it.
     #[arg(long)]
     knowledge: Option<PathBuf>,
+    /// What kind of machine bends it, so that its range and steps are kept: a shipped profile's name or a profile file [default: a
+    /// machine without limits].
+    #[arg(long, value_name = "PROFILE")]
+    bender: Option<String>,
     /// Materials file instead of the built-in one.
     #[arg(long)]
     materials: Option<PathBuf>,
@@ -39,7 +45,11 @@ pub fn run(args: &Args) -> anyhow::Result<Outcome> {
         Some(path) => store::load(path)?,
         None => Knowledge::default(),
     };
-    let limits = Limits::default();
+    let machine = match &args.bender {
+        Some(profile) => Profile::load(profile)?.limits,
+        None => MachineLimits::unlimited(),
+    };
+    let limits = Limits { machine, ..Limits::default() };
     let answer = step(&nominal, &history, &known, &limits);
     if let Some(path) = &args.knowledge {
         let learned = learn(&nominal, &history, &known, &limits);
@@ -73,6 +83,7 @@ fn table(answer: &Answer) -> String {
         ));
     }
     lines.push(format!(" end  {:>9.2}", answer.commanded.last_length_mm));
+    lines.extend(answer.predicted.as_ref().map(expected));
     lines.extend(answer.reasons.iter().map(|r| r.text.clone()));
     lines.push(
         match answer.verdict {
@@ -85,4 +96,13 @@ fn table(answer: &Answer) -> String {
         .to_owned(),
     );
     lines.join("\n") + "\n"
+}
+
+fn expected(predicted: &Predicted) -> String {
+    let Predicted { alignment, envelope_mm, worst, .. } = predicted;
+    format!(
+        "expected of the next tube ({alignment}): check points within {:.2} mm ({} of straight {}), allowed {envelope_mm}; \
+         ±{:.2} mm is not known or scatters, slip not counted",
+        worst.deviation_mm, worst.place, worst.straight, worst.sigma_mm
+    )
 }

@@ -55,9 +55,7 @@ fn measured(args: &Args, nominal: &Nominal) -> anyhow::Result<MeasuredTube> {
 fn table(inspection: &Inspection) -> String {
     let mut lines = vec![format!(
         "{}: alignment {}, envelope {} mm",
-        inspection.part,
-        serde_json::to_string(&inspection.alignment).unwrap_or_default().trim_matches('"'),
-        inspection.envelope_mm
+        inspection.part, inspection.alignment, inspection.envelope_mm
     )];
     if !inspection.points.is_empty() {
         lines.push("straight  start mm        middle mm       end mm".to_owned());

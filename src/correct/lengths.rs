@@ -127,6 +127,12 @@ impl Lengths {
         Known { value: more.value + usual_mm(&sides), sigma: more.sigma }
     }
 
+    /// The same with the feed's scatter in the sigma.
+    pub fn next_growth(&self, straight: usize, commanded_rad: &[f64], formed_rad: &[f64]) -> Known {
+        let growth = self.growth(straight, commanded_rad, formed_rad);
+        Known { sigma: growth.sigma.hypot(FEED_SCATTER_MM), ..growth }
+    }
+
     /// The feed that gives the wanted straight when the bends come out right; may be negative.
     pub fn command_for(&self, straight: usize, commanded_rad: &[f64]) -> f64 {
         let formed: Vec<f64> = self.wanted.bends.iter().map(|b| b.angle_rad).collect();

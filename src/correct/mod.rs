@@ -3,7 +3,7 @@
 //! Between `inspect` and `bender`. [`step`] is pure: history and knowledge in, one [`Answer`] out, nothing kept.
 //! The way through: [`history`] (the contract) -> [`replay`] (turn each scan round, learn from it: [`estimate`]
 //! angles, [`lengths`] feeds, [`rotations`] planes) -> `inspect` (is the newest good?) -> [`plan`] (the next table within
-//! limits) -> [`verdict`].
+//! limits; [`shape`] has the whole tube in view) -> [`predicted`] (what it will bend) -> [`verdict`].
 //!
 //! What jobs leave behind is [`knowledge`], on disk by [`store`]; [`import`] puts in what others know, [`learned`] and
 //! [`summary`] say what is believed of a key.
@@ -17,24 +17,33 @@ pub mod knowledge;
 pub mod learned;
 pub mod lengths;
 mod mixups;
+pub mod next_tube;
 pub mod plan;
+pub mod predicted;
 pub mod replay;
 pub mod rotations;
+pub mod rounding;
 mod rows;
 mod scans;
+pub mod shape;
+mod steps;
 pub mod store;
 pub mod summary;
+pub mod values;
 pub mod verdict;
 
 pub use history::{History, Part, SetUp};
 pub use knowledge::Knowledge;
 pub use plan::Limits;
+pub use predicted::{Predicted, PredictedPoint};
 pub use verdict::{Answer, Code, Reason, Verdict};
 
 use crate::inspect;
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
+use predicted::foretold;
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
+use shape::{Case, shaped};
 
 /// A change of all bends together that is likelier than this is no chance.
 const CERTAIN: f64 = 0.995;
@@ -64,13 +73,18 @@ pub fn learn(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits
 /// For tables without rows of angle 0.
 fn step_of_bends(job: &Job) -> Answer {
     let read = replay(job, false);
-    let decided = decide(job, &read);
+    foretold(job, &read, either_way(job, &read))
+}
+
+/// What is decided, unless it depends on from which end the newest part was scanned.
+fn either_way(job: &Job, read: &Replay) -> Answer {
+    let decided = decide(job, read);
     let Newest::Used { ambiguous: true, .. } = read.newest else { return decided };
     let turned = decide(job, &replay(job, true));
     if matters(&decided, &turned, job.nominal) {
         let text = "the scan fits the part from both ends, and the next table depends on which it was: mark the \
                     first end and scan again";
-        return held(job, &read, vec![Reason::new(Code::Direction, text)]);
+        return held(job, read, vec![Reason::new(Code::Direction, text)]);
     }
     decided
 }
@@ -99,6 +113,8 @@ fn decide(job: &Job, replay: &Replay) -> Answer {
 fn first_piece(job: &Job, replay: &Replay) -> Answer {
     let mut table = plan::first(&replay.model, job.nominal);
     plan::clamp(&mut table, job.limits);
+    let case = Case { model: &replay.model, nominal: job.nominal, newest: None, limits: job.limits };
+    let table = shaped(&case, table);
     let violations = plan::violations(&table, job.nominal, job.limits);
     if !violations.is_empty() {
         return held(job, replay, violations);
@@ -265,6 +281,7 @@ fn answer(verdict: Verdict, commanded: CommandTable, replay: &Replay, reasons: V
         verdict,
         springback_deg: next.iter().map(|k| clean(k.value)).collect(),
         springback_sigma_deg: next.iter().map(|k| clean(k.sigma)).collect(),
+        predicted: None,
         commanded,
         reasons: reasons.into_iter().chain(replay.left_out.iter().cloned()).collect(),
     }

@@ -1,8 +1,9 @@
 //! From belief to table: dead band, step limit, total limit, the machine's range.
 
 use super::replay::{Model, Used};
+use super::shape::{Case, shaped};
 use super::verdict::{Code, Reason};
-use crate::inspect::{corners, distances, rotation};
+use crate::inspect::{Known, corners, distances, rotation};
 use crate::tube::{CommandTable, MachineLimits, Nominal, wrap_angle};
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
@@ -95,15 +96,33 @@ pub fn next(model: &Model, nominal: &Nominal, newest: &Used, limits: &Limits) ->
     let mut plan = begin(true).planned();
     if plan.table != newest.commanded {
         plan = begin(false).planned();
+        plan.table = shaped(&Case { model, nominal, newest: Some(newest), limits }, plan.table);
     }
+    let mut reasons = plan.changes();
+    reasons.extend(plan.reasons);
     for (i, off_mm) in model.lengths.slips() {
         let text = format!(
             "feed {}: {off_mm:+.2} mm off what was expected: mostly slip of a worn clamp; not chased unless it stays",
             i + 1
         );
-        plan.reasons.push(Reason::at(Code::Slip, i, text));
+        reasons.push(Reason::at(Code::Slip, i, text));
     }
-    (plan.table, plan.reasons)
+    (plan.table, reasons)
+}
+
+/// Most that one part may change an angle.
+pub(super) fn angle_step(model: &Model, limits: &Limits, i: usize) -> f64 {
+    limits.step_angle_rad.max(3.0 * model.springback.surprise_sigma_rad(i))
+}
+
+/// The same for a feed.
+pub(super) fn length_step(model: &Model, limits: &Limits, i: usize) -> f64 {
+    limits.step_length_mm.max(3.0 * model.lengths.surprise_sigma_mm(i))
+}
+
+/// A turn that the scan shows well enough to correct it.
+pub(super) fn turn_seen(newest: &Used, nominal: &Nominal, i: usize) -> Option<Known> {
+    rotation(&newest.measured, i).filter(|r| r.sigma <= nominal.tolerance.rotation_rad / 2.0)
 }
 
 struct Plan<'a> {
@@ -132,58 +151,37 @@ impl Plan<'_> {
     }
 
     fn angle(&mut self, i: usize) {
-        let wanted = self.nominal.lra.bends[i].angle_rad;
-        let measured = &self.newest.measured.bends[i];
         let change = Change {
             current: self.table.bends[i].angle_rad,
-            wanted: self.model.springback.command_for(i, wanted),
+            wanted: self.model.springback.command_for(i, self.nominal.lra.bends[i].angle_rad),
             dead_band: self.dead_band(
                 self.nominal.tolerance.angle_rad,
-                measured.angle_sigma_rad,
+                self.newest.measured.bends[i].angle_sigma_rad,
                 self.limits.machine.angle_resolution_rad,
             ),
-            step: self.limits.step_angle_rad.max(3.0 * self.model.springback.surprise_sigma_rad(i)),
+            step: angle_step(self.model, self.limits, i),
         };
         let Some(value) = change.apply() else { return };
         self.table.bends[i].angle_rad = value;
-        let deg = f64::to_degrees;
-        let text = format!(
-            "angle {}: measured {:.2} instead of {:.2} degrees: command {:.2}, was {:.2}",
-            i + 1,
-            deg(measured.angle_rad),
-            deg(wanted),
-            deg(value),
-            deg(change.current)
-        );
-        self.reasons.push(Reason::at(Code::Angle, i, text));
         self.reasons.extend(change.cut(i, "angle", "degrees", DEGREE));
     }
 
     fn rotation(&mut self, i: usize) {
-        let tolerance = self.nominal.tolerance.rotation_rad;
-        let Some(found) = rotation(&self.newest.measured, i).filter(|r| r.sigma <= tolerance / 2.0) else {
-            return;
-        };
+        let Some(found) = turn_seen(self.newest, self.nominal, i) else { return };
         let wanted = self.nominal.lra.bends[i].rotation_rad;
         let current = self.table.bends[i].rotation_rad;
         let change = Change {
             current,
             wanted: current + wrap_angle(self.model.rotations.command_for(i, wanted) - current),
-            dead_band: self.dead_band(tolerance, found.sigma, self.limits.machine.angle_resolution_rad),
+            dead_band: self.dead_band(
+                self.nominal.tolerance.rotation_rad,
+                found.sigma,
+                self.limits.machine.angle_resolution_rad,
+            ),
             step: self.limits.step_rotation_rad,
         };
         let Some(value) = change.apply() else { return };
         self.table.bends[i].rotation_rad = value;
-        let deg = f64::to_degrees;
-        let text = format!(
-            "rotation {}: measured {:.2} instead of {:.2} degrees: command {:.2}, was {:.2}",
-            i + 1,
-            deg(wanted + wrap_angle(found.value - wanted)),
-            deg(wanted),
-            deg(value),
-            deg(current)
-        );
-        self.reasons.push(Reason::at(Code::Rotation, i, text));
         self.reasons.extend(change.cut(i, "rotation", "degrees", DEGREE));
     }
 
@@ -200,7 +198,7 @@ impl Plan<'_> {
                     found.map_or(0.0, |f| f.sigma),
                     self.limits.machine.length_resolution_mm,
                 ),
-                step: self.limits.step_length_mm.max(3.0 * self.model.lengths.surprise_sigma_mm(i)),
+                step: length_step(self.model, self.limits, i),
             };
             let Some(value) = change.apply() else { continue };
             let shortest = shortest_feed(&self.limits.machine, i);
@@ -213,14 +211,44 @@ impl Plan<'_> {
                 continue;
             }
             self.table.bends[i].length_mm = held;
-            let text = format!("feed {}: {held:.2} mm, was {:.2}", i + 1, change.current);
-            self.reasons.push(Reason::at(Code::Length, i, text));
             self.reasons.extend(change.cut(i, "feed", "mm", 1.0));
         }
     }
+
+    /// What changes in the end.
+    fn changes(&self) -> Vec<Reason> {
+        let deg = f64::to_degrees;
+        let both = || self.table.bends.iter().zip(&self.newest.commanded.bends).enumerate();
+        let wanted = &self.nominal.lra.bends;
+        let changed = |what, i: usize, found: Option<f64>, wanted: f64, new: f64, old: f64| {
+            let found = found.map_or(String::new(), |found| {
+                format!("measured {:.2} instead of {:.2} degrees: ", deg(found), deg(wanted))
+            });
+            format!("{what} {}: {found}command {:.2}, was {:.2}", i + 1, deg(new), deg(old))
+        };
+        let angles =
+            both().filter(|(_, (new, old))| new.angle_rad != old.angle_rad).map(|(i, (new, old))| {
+                let found = Some(self.newest.measured.bends[i].angle_rad);
+                let text = changed("angle", i, found, wanted[i].angle_rad, new.angle_rad, old.angle_rad);
+                Reason::at(Code::Angle, i, text)
+            });
+        let turns = both().filter(|(_, (new, old))| new.rotation_rad != old.rotation_rad);
+        let turns = turns.map(|(i, (new, old))| {
+            let wanted = wanted[i].rotation_rad;
+            let found = turn_seen(self.newest, self.nominal, i);
+            let found = found.map(|found| wanted + wrap_angle(found.value - wanted));
+            let text = changed("rotation", i, found, wanted, new.rotation_rad, old.rotation_rad);
+            Reason::at(Code::Rotation, i, text)
+        });
+        let feeds = both().filter(|(_, (new, old))| new.length_mm != old.length_mm).map(|(i, (new, old))| {
+            let text = format!("feed {}: {:.2} mm, was {:.2}", i + 1, new.length_mm, old.length_mm);
+            Reason::at(Code::Length, i, text)
+        });
+        angles.chain(turns).chain(feeds).collect()
+    }
 }
 
-fn shortest_feed(machine: &MachineLimits, i: usize) -> f64 {
+pub(super) fn shortest_feed(machine: &MachineLimits, i: usize) -> f64 {
     if i == 0 { machine.min_first_length_mm } else { machine.min_between_mm }
 }
 

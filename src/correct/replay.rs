@@ -149,7 +149,7 @@ impl Model {
     }
 
     /// The tube that a table should give, on the nominal's radii.
-    fn expected(&self, nominal: &Nominal, commanded: &CommandTable) -> Lra {
+    pub(super) fn expected(&self, nominal: &Nominal, commanded: &CommandTable) -> Lra {
         let angles: Vec<f64> = commanded.bends.iter().map(|r| r.angle_rad).collect();
         let formed: Vec<f64> =
             angles.iter().enumerate().map(|(i, &c)| c - self.springback.at(i, c).value).collect();

@@ -92,12 +92,18 @@ impl Rotations {
 
     /// The turn to command for a wanted one; the first row has no plane to turn against.
     pub fn command_for(&self, bend: usize, wanted_rad: f64) -> f64 {
+        wanted_rad - self.next_off(bend).value
+    }
+
+    /// By how much the next tube's turn comes out off the commanded one, with the axis's scatter in the sigma; 0 in the first row.
+    pub fn next_off(&self, bend: usize) -> Known {
         if bend == 0 {
-            return wanted_rad;
+            return Known { value: 0.0, sigma: 0.0 };
         }
         let mut row = DVector::zeros(self.belief.len());
         (row[0], row[1 + bend]) = (self.per_backlash[bend], 1.0);
-        wanted_rad - self.belief.predict(&row).value
+        let off = self.belief.predict(&row);
+        Known { sigma: off.sigma.hypot(AXIS_SCATTER_RAD), ..off }
     }
 }
 

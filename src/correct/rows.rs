@@ -73,10 +73,16 @@ impl Rows {
             k += usize::from(*bends);
         }
         table.last_length_mm = answer.commanded.last_length_mm - fed_mm;
+        let mut predicted = answer.predicted;
+        if let Some(predicted) = &mut predicted {
+            let mut of_bends = std::mem::take(&mut predicted.angle_deviation_deg).into_iter();
+            let of_row = |bends: &bool| if *bends { of_bends.next().unwrap_or(0.0) } else { 0.0 };
+            predicted.angle_deviation_deg = self.bends.iter().map(of_row).collect();
+        }
         let mut reasons = answer.reasons;
         for reason in &mut reasons {
             reason.bend = reason.bend.map(|b| bending.get(b - 1).map_or(b, |row| row + 1));
         }
-        Answer { commanded: table, springback_deg, springback_sigma_deg, reasons, ..answer }
+        Answer { commanded: table, springback_deg, springback_sigma_deg, predicted, reasons, ..answer }
     }
 }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::predicted::Predicted;
 use crate::tube::CommandTable;
 
 /// What to do next.
@@ -70,6 +71,12 @@ pub enum Code {
     Scatter,
     /// A feed came out unlike before: slip is not chased until it stays.
     Slip,
+    /// Values are away from their own best so that the check points come nearer.
+    WholeTube,
+    /// A limit, a clamp or a plane that is not seen keeps the tube out of tolerance.
+    OutOfReach,
+    /// The machine's steps do.
+    Resolution,
     /// An earlier part of the history was not used.
     LeftOut,
 }
@@ -111,6 +118,9 @@ pub struct Answer {
     pub springback_deg: Vec<f64>,
     /// Sigma of that for the next tube, its scatter included.
     pub springback_sigma_deg: Vec<f64>,
+    /// The next tube that is expected at this table; none in a hold, but where it proposes one for approval.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub predicted: Option<Predicted>,
     /// Why.
     pub reasons: Vec<Reason>,
 }

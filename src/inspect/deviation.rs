@@ -1,10 +1,10 @@
 //! Deviations: check points after a named alignment, and the LRA values beside their tolerances.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::laid::{Known, Layout, points_of};
-use crate::tube::align::{Pair, register};
+use crate::tube::align::{Pair, Registration, register};
 use crate::tube::{Alignment, Frame, Lra, Spine};
 
 /// A deviation against its tolerance with a guard band of two sigmas.
@@ -31,7 +31,7 @@ pub fn judge(deviation: f64, tolerance: f64, sigma: f64) -> State {
 }
 
 /// Which of a straight's three check points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Place {
     /// Tangent point where the straight begins; the tube's end in the first straight.
@@ -40,6 +40,16 @@ pub enum Place {
     Middle,
     /// Tangent point where it ends; the tube's end in the last straight.
     End,
+}
+
+impl std::fmt::Display for Place {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Place::Start => "start",
+            Place::Middle => "middle",
+            Place::End => "end",
+        })
+    }
 }
 
 /// One check point, measured tube laid over the nominal.
@@ -80,10 +90,10 @@ pub fn compare(layout: &Layout, nominal: &Lra, alignment: Alignment, envelope_mm
     let wanted = points_of(nominal);
     let known = layout.known_points();
     let weights = weights(&known, &wanted, alignment);
-    let (base, rms_mm) = aligned(layout, &wanted, &weights)?;
+    let Aligned { points: base, rms_mm, .. } = aligned(layout.points(), &wanted, &weights)?;
     let mut covariance = vec![[Matrix3::<f64>::zeros(); 3]; wanted.len()];
     for moved in one_sigma_each(layout) {
-        let (points, _) = aligned(&moved, &wanted, &weights)?;
+        let Aligned { points, .. } = aligned(moved.points(), &wanted, &weights)?;
         for (c, (p, b)) in
             covariance.iter_mut().flatten().zip(points.iter().flatten().zip(base.iter().flatten()))
         {
@@ -117,8 +127,18 @@ pub fn compare(layout: &Layout, nominal: &Lra, alignment: Alignment, envelope_mm
 
 type Points = Vec<[Point3<f64>; 3]>;
 
-fn aligned(layout: &Layout, wanted: &Points, weights: &[[f64; 3]]) -> Option<(Points, f64)> {
-    let points = layout.points();
+/// Check points laid over the nominal's.
+pub(super) struct Aligned {
+    /// In the nominal's frame.
+    pub points: Points,
+    /// What brought them there.
+    pub motion: Isometry3<f64>,
+    /// Weighted root mean square distance.
+    pub rms_mm: f64,
+}
+
+/// Lays check points over the nominal's; None without any weight.
+pub(super) fn aligned(points: Points, wanted: &Points, weights: &[[f64; 3]]) -> Option<Aligned> {
     let pairs: Vec<Pair> = points
         .iter()
         .flatten()
@@ -126,14 +146,14 @@ fn aligned(layout: &Layout, wanted: &Points, weights: &[[f64; 3]]) -> Option<(Po
         .filter(|(_, (_, weight))| **weight > 0.0)
         .map(|(from, (to, weight))| Pair { from: *from, to: *to, weight: *weight })
         .collect();
-    let found = register(&pairs)?;
-    let motion: Isometry3<f64> = found.motion;
-    Some((points.iter().map(|straight| straight.map(|p| motion * p)).collect(), found.rms_mm))
+    let Registration { motion, rms_mm } = register(&pairs)?;
+    let points = points.iter().map(|straight| straight.map(|p| motion * p)).collect();
+    Some(Aligned { points, motion, rms_mm })
 }
 
 /// How much each check point counts in the alignment. A single straight leaves the turn about itself open:
 /// the next one decides that alone, with a weight that cannot pull the straight away.
-fn weights(known: &[[bool; 3]], wanted: &Points, alignment: Alignment) -> Vec<[f64; 3]> {
+pub(super) fn weights(known: &[[bool; 3]], wanted: &Points, alignment: Alignment) -> Vec<[f64; 3]> {
     const TURN_ONLY: f64 = 1e-6;
     let last = known.len() - 1;
     let of_straight = |j: usize| match alignment {

@@ -12,6 +12,7 @@
 mod deviation;
 mod fit;
 mod laid;
+mod overlay;
 
 use serde::Serialize;
 use thiserror::Error;
@@ -19,6 +20,7 @@ use thiserror::Error;
 pub use deviation::{BendDeviation, Comparison, Place, PointDeviation, State, judge};
 pub use fit::{Misfit, Reading, misfit, reading};
 pub use laid::{Known, corners, distances, rotation, table_distances};
+pub use overlay::{Overlay, check_point};
 
 use crate::tube::{Alignment, Lra, MeasuredTube, Nominal, wrap_angle};
 use deviation::{Compared, compare};
@@ -329,12 +331,7 @@ fn lengths_and_turns(inspection: &Inspection) -> impl Iterator<Item = (String, &
 fn worst(inspection: &Inspection, state: State) -> Option<String> {
     let mut found: Vec<(f64, String)> = Vec::new();
     for p in inspection.points.iter().filter(|p| p.state == state) {
-        let place = match p.place {
-            Place::Start => "start",
-            Place::Middle => "middle",
-            Place::End => "end",
-        };
-        let text = format!("{place} of straight {} is {:.2} mm off", p.straight, p.deviation_mm);
+        let text = format!("{} of straight {} is {:.2} mm off", p.place, p.straight, p.deviation_mm);
         found.push((p.deviation_mm / inspection.envelope_mm, text));
     }
     let angles = inspection.bends.iter().map(|b| (format!("angle of bend {}", b.bend), &b.angle_deg));

@@ -1,11 +1,11 @@
 //! The part as drawn: nominal LRA, tube, die, tolerance. Read from part files by `config`.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::{Lra, Material};
 
 /// The named way in which measured and nominal are laid over each other before points are compared.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Alignment {
     /// Least squares over all tangent points and middles.
@@ -19,6 +19,18 @@ pub enum Alignment {
     Weighted,
     /// Least squares over the two end straights, as a gauge holds the tube.
     Fixture,
+}
+
+impl std::fmt::Display for Alignment {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Alignment::BestFit => "best-fit",
+            Alignment::AEnd => "a-end",
+            Alignment::BEnd => "b-end",
+            Alignment::Weighted => "weighted",
+            Alignment::Fixture => "fixture",
+        })
+    }
 }
 
 /// How far off is still good.
