@@ -363,13 +363,27 @@ fn armed_again_after_a_hold_the_job_goes_on_and_after_a_foreign_table_it_begins_
 }
 
 #[test]
-fn a_part_that_was_not_judged_has_no_say() {
-    for verdict in [Verdict::Rescan, Verdict::Hold] {
-        let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
-        assert_eq!(b.cell.history().len(), 1);
-        b.decide(verdict);
-        assert_eq!(b.cell.history().len(), 0, "{verdict:?}");
-    }
+fn a_part_that_was_held_has_no_say() {
+    let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
+    assert_eq!(b.cell.history().len(), 1);
+    b.decide(Verdict::Hold);
+    assert_eq!(b.cell.history().len(), 0);
+}
+
+#[test]
+fn a_tube_that_is_scanned_again_stays_one_tube() {
+    let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
+    b.decide(Verdict::Rescan);
+    assert_eq!(name(b.cell.state()), "Ready");
+    let scan_again = |b: &mut Bench| {
+        b.on(Event::Scan(scan()));
+        b.read(2);
+        b.on(Event::Measured(b.ticket, tube()));
+        b.cell.history().iter().map(|part| part.rescan).collect::<Vec<bool>>()
+    };
+    assert_eq!(scan_again(&mut b), [false, true]);
+    b.decide(Verdict::InTolerance);
+    assert_eq!(scan_again(&mut b), [false, true, false], "the next tube is another one");
 }
 
 #[test]

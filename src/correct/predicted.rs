@@ -45,16 +45,17 @@ pub struct PredictedPoint {
     pub sigma_mm: f64,
 }
 
-/// The answer with what is expected of its table; a hold bends nothing.
+/// The answer with what is expected of its table; a hold bends nothing, unless it proposes a table for approval.
 pub fn foretold(job: &Job, replay: &Replay, mut answer: Answer) -> Answer {
     let wanted = job.nominal.lra.bends.len();
-    if answer.verdict == Verdict::Hold || answer.commanded.bends.len() != wanted {
+    let proposes = answer.is_about(Code::BatchChanged);
+    if (answer.verdict == Verdict::Hold && !proposes) || answer.commanded.bends.len() != wanted {
         return answer;
     }
     let Replay { model, used, .. } = replay;
     let case = Case { model, nominal: job.nominal, newest: used.last(), limits: job.limits };
     let Some(tube) = case.next_tube(&answer.commanded) else { return answer };
-    if matches!(answer.verdict, Verdict::FirstPiece | Verdict::Correct) {
+    if proposes || matches!(answer.verdict, Verdict::FirstPiece | Verdict::Correct) {
         answer.reasons.extend(reasons(&case, &answer.commanded, &tube));
     }
     answer.predicted = Some(predicted(&case, &answer.commanded, &tube));

@@ -118,7 +118,7 @@ pub struct Answer {
     pub springback_deg: Vec<f64>,
     /// Sigma of that for the next tube, its scatter included.
     pub springback_sigma_deg: Vec<f64>,
-    /// The next tube that is expected at this table; none in a hold.
+    /// The next tube that is expected at this table; none in a hold, but where it proposes one for approval.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub predicted: Option<Predicted>,
     /// Why.

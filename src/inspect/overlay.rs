@@ -148,14 +148,14 @@ mod tests {
         for alignment in ALL {
             let moves = Overlay::new(&nominal, &nominal, alignment).unwrap().moves();
             for column in 0..3 * nominal.bends.len() {
-                let step = if column % 3 == 0 { 1e-3 } else { 1e-5 };
+                let step = if column % 3 == 0 { 0.1 } else { 1e-3 };
                 let off =
                     |by| Overlay::new(&moved(&nominal, column, by), &nominal, alignment).unwrap().off_mm;
                 for (k, (more, less)) in off(step).iter().zip(off(-step)).enumerate() {
                     let found = (more - less) / (2.0 * step);
                     let said = moves.fixed_view::<3, 1>(3 * k, column);
                     assert!(
-                        (found - said).norm() < 1e-3 * (1.0 + found.norm()),
+                        (found - said).norm() < 3e-3 * (1.0 + found.norm()),
                         "{alignment:?}, column {column}, point {k}: {found} {said}"
                     );
                 }
@@ -167,7 +167,7 @@ mod tests {
     fn the_nominal_lies_on_itself() {
         for alignment in ALL {
             let overlay = Overlay::new(&tube(), &tube(), alignment).unwrap();
-            assert!(overlay.off_mm.len() == 15 && overlay.off_mm.iter().all(|d| d.norm() < 1e-9));
+            assert!(overlay.off_mm.len() == 15 && overlay.off_mm.iter().all(|d| d.norm() < 1e-6));
         }
         assert_eq!((check_point(0), check_point(14)), ((1, Place::Start), (5, Place::End)));
     }
