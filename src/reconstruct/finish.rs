@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use super::error::ReconstructError;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
 use super::flattening::{self, freed};
-use super::measure::{self, EndPoints};
+use super::measure::{self, EndPoints, RadiusDoubt};
 use super::model::Flattening;
 use super::moments::Sample;
 use super::moves::without_bend;
@@ -17,7 +17,7 @@ use super::profile;
 use super::realign;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
-use super::undecided::{Undecided, widened};
+use super::undecided::{self, Undecided, widened};
 use super::whole::{Whole, end_frames};
 use super::{Reconstruction, TubeModel};
 use crate::tube::{Frame, MeasuredTube};
@@ -115,7 +115,9 @@ fn finish_as_chosen(
     let ends = end_points(&whole, shown, &best);
     let moved_mm = realign::moved_mm(whole.passes(), &best.model);
     let radius_doubt = (correlation.along_arc / correlation.near).sqrt();
-    let mut measured = measure::measure(&mut best, ends, radius_doubt, moved_mm);
+    let doubt = |bend| undecided::radius_doubt_mm(&chosen.undecided, bend);
+    let radii = RadiusDoubt { times: radius_doubt, besides_mm: (0..best.model.lra.bends.len()).map(doubt).collect() };
+    let mut measured = measure::measure(&mut best, ends, &radii, moved_mm);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });

@@ -51,9 +51,17 @@ pub struct EndPoints {
     pub hidden: [bool; 2],
 }
 
+/// How much less sure the bends' CLRs are than the covariance says.
+pub struct RadiusDoubt {
+    /// Standard deviations over the covariance's.
+    pub times: f64,
+    /// Each bend's own, besides.
+    pub besides_mm: Vec<f64>,
+}
+
 /// Sets the end straights' lengths from the points at both ends and puts sigmas beside all
-/// values; the radii's are `radius_doubt` times what the covariance says. The scan's passes were moved by about `moved_mm`.
-pub fn measure(fit: &mut Fit, end_points: EndPoints, radius_doubt: f64, moved_mm: f64) -> MeasuredTube {
+/// values. The scan's passes were moved by about `moved_mm`.
+pub fn measure(fit: &mut Fit, end_points: EndPoints, doubt: &RadiusDoubt, moved_mm: f64) -> MeasuredTube {
     let Scanned { ends, first, last } = set_ends(fit, end_points, moved_mm);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
@@ -61,7 +69,7 @@ pub fn measure(fit: &mut Fit, end_points: EndPoints, radius_doubt: f64, moved_mm
     let covariance = &jacobian * &fit.covariance * jacobian.transpose();
     let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
     let mut sigma = at.like(sigmas);
-    sigma.radii.iter_mut().for_each(|s| *s *= radius_doubt);
+    sigma.radii.iter_mut().zip(&doubt.besides_mm).for_each(|(s, more)| *s = (*s * doubt.times).hypot(*more));
     let n = fit.model.lra.bends.len();
     let oval = (0..n).map(|i| fit.model.may_be_oval(i)).collect();
     let flattened = fit.model.flattening.is_free();
