@@ -122,6 +122,13 @@ pub struct Structure {
     pub decisions: Vec<Decision>,
 }
 
+impl Structure {
+    /// The same with another tube that has fewer bends.
+    pub fn with_fewer_bends(&self, model: TubeModel) -> Structure {
+        Structure { model, undecided: Undecided::new(), ..self.clone() }
+    }
+}
+
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
 pub fn choose(shown: &Shown) -> Option<Structure> {
     let (jury, best) = searched(shown, None)?;
@@ -347,7 +354,7 @@ impl Jury {
         let (mut best, mut score) = self.fit_walls(&mut sample, &model);
         let other = other.map(|model| self.fit_walls(&mut sample, &model)).filter(|o| o.1 < score);
         if let Some(other) = other {
-            self.decide("the tube as found without flat walls".to_owned(), None, score - other.1, true);
+            self.decide("the tube as found before".to_owned(), None, score - other.1, true);
             self.line = CentreLine::measure(points, &other.0.model, true);
             (best, score) = other;
         }
