@@ -16,6 +16,7 @@ use super::outline::solid_start;
 use super::profile;
 use super::realign;
 use super::search::UNSURE;
+use super::shade;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
 use super::undecided::{self, widened};
@@ -199,7 +200,8 @@ fn end_points(whole: &Whole, shown: &Shown, fit: &Fit) -> EndPoints {
     let reach_mm = HIDDEN_RADII * fit.model.tube_radius_mm;
     let is_hidden = |end: Frame| shown.hidden.iter().any(|p| (end.inverse() * p).coords.norm() < reach_mm);
     let hidden = end_frames(&fit.model.spine()).map(is_hidden);
-    EndPoints { points: points_at_ends(whole, shown.sample, fit), hidden }
+    let sight = shade::sight(shown.sample, &fit.model);
+    EndPoints { points: points_at_ends(whole, shown.sample, fit), hidden, sight }
 }
 
 /// See [`Whole::ends`].

@@ -1,11 +1,14 @@
 //! From the fit to measured values: ends, sigmas from the full covariance, unknown where the data is silent.
 
-use nalgebra::{DMatrix, DVector, Point3};
+use std::ops::Range;
+
+use nalgebra::{DMatrix, DVector, Point3, Vector3};
 
 use super::ends::{self, End};
 use super::fit::Fit;
 use super::model::{Parameter, TubeModel};
 use super::passes;
+use super::shade;
 use super::whole::end_frames;
 use crate::tube::{Frame, MeasuredBend, MeasuredTube, Spine};
 
@@ -49,6 +52,8 @@ pub struct EndPoints {
     pub points: [Vec<Point3<f64>>; 2],
     /// Whether more may be behind a stretch that was not scanned.
     pub hidden: [bool; 2],
+    /// The direction to the scanner, where the tube was scanned from one side only.
+    pub sight: Option<Vector3<f64>>,
 }
 
 /// How much less sure the bends' CLRs are than the covariance says.
@@ -171,6 +176,11 @@ impl Report {
                     "the points stop here and there, about {least:.1} mm from the bend; scan past that end"
                 )
             }
+            Some(End::Shaded { .. }) => {
+                format!(
+                    "another leg of the tube hides what may follow; at least {least:.1} mm; scan from another side too"
+                )
+            }
             _ => "that end of the tube was not scanned".to_owned(),
         }
     }
@@ -236,17 +246,31 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, EndPoints { points, hidden }: EndPoints, moved_mm: f64) -> Scanned {
+fn set_ends(fit: &mut Fit, EndPoints { points, hidden, sight }: EndPoints, moved_mm: f64) -> Scanned {
     let [first_points, last_points] = points;
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
-    let [first_frame, last_frame] = end_frames(&fit.model.spine());
+    let spine = fit.model.spine();
+    let [first_frame, last_frame] = end_frames(&spine);
     // Along the tube passes are known to lie on each other no better than they did across it before.
     let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise).max(moved_mm);
-    let find = |points, hidden| match ends::find(points, radius, noise, passes_mm) {
+    let is_shaded = |frame: &Frame, legs: &Range<f64>, at_mm: f64| {
+        let end = frame * Frame::translation(at_mm, 0.0, 0.0);
+        sight.is_some_and(|sight| shade::is_shaded(&sight, &spine, legs.clone(), &end, radius))
+    };
+    let find = |points, hidden, frame, legs| match ends::find(points, radius, noise, passes_mm) {
         Some(End::Found(e)) if hidden && e.by_outline => Some(End::Ragged { at_mm: e.at_mm }),
+        Some(End::Found(e)) if e.by_outline && is_shaded(frame, legs, e.at_mm) => {
+            Some(End::Shaded { at_mm: e.at_mm })
+        }
         found => found,
     };
-    let (first, last) = rayon::join(|| find(first_points, hidden[0]), || find(last_points, hidden[1]));
+    let segments = spine.segments();
+    let behind_first = segments[0].length_mm..spine.length_mm();
+    let before_last = 0.0..segments[segments.len() - 1].start_mm;
+    let (first, last) = rayon::join(
+        || find(first_points, hidden[0], &first_frame, &behind_first),
+        || find(last_points, hidden[1], &last_frame, &before_last),
+    );
     let model = &mut fit.model;
     if let Some(end) = last {
         model.lra.last_length_mm -= end.at_mm();

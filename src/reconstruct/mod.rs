@@ -50,6 +50,7 @@ mod search_tests;
 mod section;
 mod sections;
 mod seen;
+mod shade;
 pub mod simplify;
 mod square;
 mod strangers;
