@@ -47,6 +47,45 @@ pub fn is_closed(chain: &[Point3<f64>], spacing_mm: f64, radius_mm: f64) -> bool
     (last - first).norm() < REACH_SPACINGS * spacing_mm && length_mm(chain) > 6.0 * radius_mm
 }
 
+/// A chain that leads straight on from its end to its own begin, over less of a gap than it has itself, with its ends where that one
+/// was: a tube whose ends come near each other, seen in two pieces that were joined the wrong way round.
+pub fn opened(mut chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
+    let gap_mm = |i: &usize| (chain[*i] - chain[i - 1]).norm();
+    let Some(widest) = (1..chain.len()).max_by(|a, b| gap_mm(a).total_cmp(&gap_mm(b))) else { return chain };
+    let widest_mm = gap_mm(&widest);
+    let around_mm = (chain[0] - chain[chain.len() - 1]).norm();
+    let is_bridge = widest_mm >= REACH_SPACINGS * spacing_mm && around_mm < widest_mm;
+    if is_bridge && is_straight_across(&chain, &chain, radius_mm) {
+        chain.rotate_left(widest);
+    }
+    chain
+}
+
+/// A chain without the pieces between two gaps that are shorter than either and than a tube radius, where the gap without
+/// such a piece may be one bend's: a scrap of a jaw that hides the tube there.
+pub fn without_scraps(mut chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
+    let mut from = None;
+    let mut i = 1;
+    while i < chain.len() {
+        let gap_mm = (chain[i] - chain[i - 1]).norm();
+        if gap_mm < REACH_SPACINGS * spacing_mm {
+            i += 1;
+            continue;
+        }
+        if let Some((begin, before_mm)) = from {
+            let length_mm = length_mm(&chain[begin..i]);
+            let is_scrap = length_mm < radius_mm.min(gap_mm).min(before_mm);
+            if is_scrap && is_across_one_bend(&chain[..begin], &chain[i..], radius_mm) {
+                chain.drain(begin..i);
+                (from, i) = (Some((begin, (chain[begin] - chain[begin - 1]).norm())), begin + 1);
+                continue;
+            }
+        }
+        (from, i) = (Some((i, gap_mm)), i + 1);
+    }
+    chain
+}
+
 /// A chain without scraps at its ends: what is shorter than the gap before it, and than a tube radius or where no single bend
 /// leads across the gap, is no continuation that anyone could vouch for.
 pub fn trimmed(mut chain: Vec<Point3<f64>>, spacing_mm: f64, radius_mm: f64) -> Vec<Point3<f64>> {
@@ -115,6 +154,22 @@ fn is_across_one_bend(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm:
     let behind_mm = (along_on - cos * along_out) / square;
     let skew_mm = (gap - out * before_mm - on * behind_mm).norm();
     skew_mm < slack_mm && before_mm.min(behind_mm) > tangent_mm - slack_mm
+}
+
+/// Whether a straight leads from the end of one piece to the begin of another.
+fn is_straight_across(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> bool {
+    let (from, to) = (before[before.len() - 1], behind[0]);
+    let (Some(back), Some(on)) =
+        (heading(from, before.iter().rev(), radius_mm), heading(to, behind.iter(), radius_mm))
+    else {
+        return false;
+    };
+    let (out, gap) = (-back, to - from);
+    let slack_mm = SLACK_RADII * radius_mm + ASTRAY * gap.norm();
+    out.dot(&on) > 0.0
+        && gap.dot(&out) > 0.0
+        && out.cross(&on).norm() < PARALLEL
+        && gap.cross(&out).norm() < slack_mm
 }
 
 /// Joins points spaced by about `spacing_mm` on tubes of radius `radius_mm` to polygons, the longest first.
@@ -350,6 +405,36 @@ mod tests {
         let moved = two.clone().into_iter().map(|s| SpinePoint { point: s.point + Vector3::z() * 50.0, ..s });
         two.extend(moved);
         assert_eq!(connect(&two, 3.0, 10.0).len(), 2);
+    }
+
+    #[test]
+    fn pieces_joined_at_the_wrong_gap_are_opened_there() {
+        // Of a circle a tenth is missing, and a little opposite to it, where the chain begins.
+        let on = |from: Point3<f64>, way: Vector3<f64>, count: i32| {
+            (0..count).map(move |i| from + way * f64::from(i))
+        };
+        let (x, y) = (2.0 * Vector3::x(), 2.0 * Vector3::y());
+        let hook: Vec<_> = on(Point3::new(30.0, 0.0, 0.0), x, 40)
+            .chain(on(Point3::new(110.0, 0.0, 0.0), y, 20))
+            .chain(on(Point3::new(110.0, 40.0, 0.0), -x, 60))
+            .collect();
+        // Its ends are 50 mm apart; the piece before them begins behind a gap of 20 mm.
+        let before = on(Point3::new(-60.0, 0.0, 0.0), x, 35);
+        let right: Vec<_> = before.clone().chain(hook.clone()).collect();
+        let wrong: Vec<_> = hook.into_iter().chain(before).collect();
+        assert_eq!(opened(wrong, 2.0, 10.0), right);
+        assert_eq!(opened(right.clone(), 2.0, 10.0), right, "as it should be");
+    }
+
+    #[test]
+    fn a_scrap_beside_a_gap_is_left_out() {
+        let line = |from: i32, to: i32| (from..to).map(|i| Point3::new(2.0 * f64::from(i), 0.0, 0.0));
+        let scrap = [Point3::new(88.0, 12.0, 0.0), Point3::new(90.0, 12.0, 0.0)];
+        let with: Vec<_> = line(0, 40).chain(scrap).chain(line(50, 90)).collect();
+        let without: Vec<_> = line(0, 40).chain(line(50, 90)).collect();
+        assert_eq!(without_scraps(with, 2.0, 10.0), without);
+        let whole: Vec<_> = line(0, 90).collect();
+        assert_eq!(without_scraps(whole.clone(), 2.0, 10.0), whole);
     }
 
     #[test]

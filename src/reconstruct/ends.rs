@@ -16,6 +16,8 @@ const STEEPEST_FACES: [f64; 2] = [0.1228, MOST_OBLIQUE];
 const MAX_CUT_SIGMA_RAD: f64 = std::f64::consts::PI / 180.0;
 /// Share of the sectors around the tube that must end together.
 const LEAST_AGREEING: f64 = 0.6;
+/// The same where the end is not square: a jaw whose shadow takes a third of a square end makes a mitre of it.
+const LEAST_AGREEING_MITRED: f64 = 0.75;
 /// Points this far from the outside, in standard deviations of noise and passes, show where it stops. Few are within it, where
 /// the face's rim would pile up.
 const OUTSIDE_SIGMAS: std::ops::Range<f64> = -1.0..3.5;
@@ -48,6 +50,11 @@ pub enum End {
         /// Where most of them begin.
         at_mm: f64,
     },
+    /// Another leg of the tube hides what may follow.
+    Shaded {
+        /// Where the points begin.
+        at_mm: f64,
+    },
 }
 
 /// Where the end's plane meets the axis.
@@ -68,7 +75,7 @@ impl End {
     pub fn at_mm(&self) -> f64 {
         match self {
             End::Found(place) => place.at_mm,
-            End::CutOff { at_mm, .. } | End::Ragged { at_mm } => *at_mm,
+            End::CutOff { at_mm, .. } | End::Ragged { at_mm } | End::Shaded { at_mm } => *at_mm,
         }
     }
 }
@@ -131,7 +138,9 @@ fn by_outline(outline: &Outline, noise_mm: f64) -> End {
     if slope - OBLIQUE_SIGMAS * outline.loose_sigma > MOST_OBLIQUE {
         return End::CutOff { at_mm: outline.loose_at_mm, slope_rad: slope.atan() };
     }
-    if outline.agreeing < LEAST_AGREEING {
+    let mitre = outline.slope[0].hypot(outline.slope[1]);
+    let is_mitred = mitre > DIFFERENT_SIGMAS * outline.loose_sigma;
+    if outline.agreeing < if is_mitred { LEAST_AGREEING_MITRED } else { LEAST_AGREEING } {
         return End::Ragged { at_mm };
     }
     let cut_rad = cut(&outline.slope, &outline.slope_variance);

@@ -8,16 +8,18 @@ use nalgebra::Point3;
 use super::error::ReconstructError;
 use super::fit::{CUTOFF_SIGMAS, Effort, Fit, fit, polish};
 use super::flattening::{self, freed};
-use super::measure::{self, EndPoints};
+use super::measure::{self, EndPoints, RadiusDoubt};
 use super::model::Flattening;
 use super::moments::Sample;
-use super::moves::without_bend;
+use super::moves::{joined, without_bend};
 use super::outline::solid_start;
 use super::profile;
 use super::realign;
+use super::search::UNSURE;
+use super::shade;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
-use super::undecided::{Undecided, widened};
+use super::undecided::{self, widened};
 use super::whole::{Whole, end_frames};
 use super::{Reconstruction, TubeModel};
 use crate::tube::{Frame, MeasuredTube};
@@ -41,7 +43,8 @@ const END_RADII: std::ops::RangeInclusive<f64> = 2.5..=8.5;
 const END_POINTS: f64 = 60_000.0;
 
 /// Fits and measures the tube. A bend at one of its ends whose angle the points do not tell is a few points of
-/// something that touches the tube there, a jaw or a lip: it is left out, and that end's length is not known.
+/// something that touches the tube there, a jaw or a lip: it is left out, and that end's length is not known. One that touches another
+/// and whose angle the points do not tell from that one's is one with it.
 pub fn finish(
     shown: &Shown,
     warnings: &[String],
@@ -51,14 +54,14 @@ pub fn finish(
     let Err(ReconstructError::Undetermined { bend, .. }) = &found else { return found };
     let bends = chosen.model.lra.bends.len();
     let (first, last) = (*bend == 1, *bend == bends);
-    if bends < 2 || !(first || last) {
+    if bends > 1 && !(first || last) {
+        let one = joined(&chosen.model, bend - 1).map(|model| chosen.with_fewer_bends(model));
+        return one.map_or(found, |one| finish_as_chosen(shown, warnings, &one));
+    }
+    if bends < 2 {
         return found;
     }
-    let less = Structure {
-        model: without_bend(&chosen.model, bend - 1),
-        undecided: Undecided::new(),
-        ..chosen.clone()
-    };
+    let less = chosen.with_fewer_bends(without_bend(&chosen.model, bend - 1));
     let mut trimmed = finish_as_chosen(shown, warnings, &less)?;
     forget_end(&mut trimmed.measured, first);
     Ok(trimmed)
@@ -115,8 +118,15 @@ fn finish_as_chosen(
     let ends = end_points(&whole, shown, &best);
     let moved_mm = realign::moved_mm(whole.passes(), &best.model);
     let radius_doubt = (correlation.along_arc / correlation.near).sqrt();
-    let mut measured = measure::measure(&mut best, ends, radius_doubt, moved_mm);
+    let doubt = |bend| undecided::radius_doubt_mm(&chosen.undecided, bend);
+    let radii =
+        RadiusDoubt { times: radius_doubt, besides_mm: (0..best.model.lra.bends.len()).map(doubt).collect() };
+    let mut measured = measure::measure(&mut best, ends, &radii, moved_mm);
     if let Some(bend) = measured.bends.iter().position(|b| b.angle_sigma_rad > MAX_ANGLE_SIGMA_RAD) {
+        let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
+        return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
+    }
+    if let Some(bend) = unsure_end(&measured) {
         let sigma_deg = measured.bends[bend].angle_sigma_rad.to_degrees();
         return Err(ReconstructError::Undetermined { bend: bend + 1, sigma_deg });
     }
@@ -134,6 +144,13 @@ fn finish_as_chosen(
         Flattening::Known(_) => Vec::new(),
     };
     Ok(Reconstruction { measured, spine, lra, ovality_mm, flattening_mm })
+}
+
+/// A bend at an end of a tube with others, whose angle is not known from none.
+fn unsure_end(measured: &MeasuredTube) -> Option<usize> {
+    let bends = &measured.bends;
+    let last = bends.len().checked_sub(1).filter(|last| *last > 0)?;
+    [0, last].into_iter().find(|&i| bends[i].angle_rad < UNSURE * bends[i].angle_sigma_rad)
 }
 
 /// The bend, counted from 1, behind which the points show no straight; or too short a one where they stop before the tube does:
@@ -183,7 +200,8 @@ fn end_points(whole: &Whole, shown: &Shown, fit: &Fit) -> EndPoints {
     let reach_mm = HIDDEN_RADII * fit.model.tube_radius_mm;
     let is_hidden = |end: Frame| shown.hidden.iter().any(|p| (end.inverse() * p).coords.norm() < reach_mm);
     let hidden = end_frames(&fit.model.spine()).map(is_hidden);
-    EndPoints { points: points_at_ends(whole, shown.sample, fit), hidden }
+    let sight = shade::sight(shown.sample, &fit.model);
+    EndPoints { points: points_at_ends(whole, shown.sample, fit), hidden, sight }
 }
 
 /// See [`Whole::ends`].

@@ -1,11 +1,14 @@
 //! From the fit to measured values: ends, sigmas from the full covariance, unknown where the data is silent.
 
-use nalgebra::{DMatrix, DVector, Point3};
+use std::ops::Range;
+
+use nalgebra::{DMatrix, DVector, Point3, Vector3};
 
 use super::ends::{self, End};
 use super::fit::Fit;
 use super::model::{Parameter, TubeModel};
 use super::passes;
+use super::shade;
 use super::whole::end_frames;
 use crate::tube::{Frame, MeasuredBend, MeasuredTube, Spine};
 
@@ -49,11 +52,21 @@ pub struct EndPoints {
     pub points: [Vec<Point3<f64>>; 2],
     /// Whether more may be behind a stretch that was not scanned.
     pub hidden: [bool; 2],
+    /// The direction to the scanner, where the tube was scanned from one side only.
+    pub sight: Option<Vector3<f64>>,
+}
+
+/// How much less sure the bends' CLRs are than the covariance says.
+pub struct RadiusDoubt {
+    /// Standard deviations over the covariance's.
+    pub times: f64,
+    /// Each bend's own, besides.
+    pub besides_mm: Vec<f64>,
 }
 
 /// Sets the end straights' lengths from the points at both ends and puts sigmas beside all
-/// values; the radii's are `radius_doubt` times what the covariance says. The scan's passes were moved by about `moved_mm`.
-pub fn measure(fit: &mut Fit, end_points: EndPoints, radius_doubt: f64, moved_mm: f64) -> MeasuredTube {
+/// values. The scan's passes were moved by about `moved_mm`.
+pub fn measure(fit: &mut Fit, end_points: EndPoints, doubt: &RadiusDoubt, moved_mm: f64) -> MeasuredTube {
     let Scanned { ends, first, last } = set_ends(fit, end_points, moved_mm);
     let (first_cut, last_cut) = (cut(first), cut(last));
     let at = values(&fit.model, &ends);
@@ -61,7 +74,7 @@ pub fn measure(fit: &mut Fit, end_points: EndPoints, radius_doubt: f64, moved_mm
     let covariance = &jacobian * &fit.covariance * jacobian.transpose();
     let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
     let mut sigma = at.like(sigmas);
-    sigma.radii.iter_mut().for_each(|s| *s *= radius_doubt);
+    sigma.radii.iter_mut().zip(&doubt.besides_mm).for_each(|(s, more)| *s = (*s * doubt.times).hypot(*more));
     let n = fit.model.lra.bends.len();
     let oval = (0..n).map(|i| fit.model.may_be_oval(i)).collect();
     let flattened = fit.model.flattening.is_free();
@@ -163,6 +176,11 @@ impl Report {
                     "the points stop here and there, about {least:.1} mm from the bend; scan past that end"
                 )
             }
+            Some(End::Shaded { .. }) => {
+                format!(
+                    "another leg of the tube hides what may follow; at least {least:.1} mm; scan from another side too"
+                )
+            }
             _ => "that end of the tube was not scanned".to_owned(),
         }
     }
@@ -228,17 +246,31 @@ impl Report {
 }
 
 /// Finds both ends and lets the model's end straights reach them.
-fn set_ends(fit: &mut Fit, EndPoints { points, hidden }: EndPoints, moved_mm: f64) -> Scanned {
+fn set_ends(fit: &mut Fit, EndPoints { points, hidden, sight }: EndPoints, moved_mm: f64) -> Scanned {
     let [first_points, last_points] = points;
     let (radius, noise) = (fit.model.tube_radius_mm, fit.sigma_mm);
-    let [first_frame, last_frame] = end_frames(&fit.model.spine());
+    let spine = fit.model.spine();
+    let [first_frame, last_frame] = end_frames(&spine);
     // Along the tube passes are known to lie on each other no better than they did across it before.
     let passes_mm = passes::disagreement_mm([&first_points, &last_points], radius, noise).max(moved_mm);
-    let find = |points, hidden| match ends::find(points, radius, noise, passes_mm) {
+    let is_shaded = |frame: &Frame, legs: &Range<f64>, at_mm: f64| {
+        let end = frame * Frame::translation(at_mm, 0.0, 0.0);
+        sight.is_some_and(|sight| shade::is_shaded(&sight, &spine, legs.clone(), &end, radius))
+    };
+    let find = |points, hidden, frame, legs| match ends::find(points, radius, noise, passes_mm) {
         Some(End::Found(e)) if hidden && e.by_outline => Some(End::Ragged { at_mm: e.at_mm }),
+        Some(End::Found(e)) if e.by_outline && is_shaded(frame, legs, e.at_mm) => {
+            Some(End::Shaded { at_mm: e.at_mm })
+        }
         found => found,
     };
-    let (first, last) = rayon::join(|| find(first_points, hidden[0]), || find(last_points, hidden[1]));
+    let segments = spine.segments();
+    let behind_first = segments[0].length_mm..spine.length_mm();
+    let before_last = 0.0..segments[segments.len() - 1].start_mm;
+    let (first, last) = rayon::join(
+        || find(first_points, hidden[0], &first_frame, &behind_first),
+        || find(last_points, hidden[1], &last_frame, &before_last),
+    );
     let model = &mut fit.model;
     if let Some(end) = last {
         model.lra.last_length_mm -= end.at_mm();

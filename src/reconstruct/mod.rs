@@ -50,6 +50,7 @@ mod search_tests;
 mod section;
 mod sections;
 mod seen;
+mod shade;
 pub mod simplify;
 mod square;
 mod strangers;
@@ -194,8 +195,9 @@ fn by(
     let again =
         (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
     if let Some(again) = &again {
-        let flattening = Flattening::NONE;
-        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, before: None, ..shown };
+        // What was found must not be lost: the polygon, which begins anew, is of the passes as they were.
+        let (flattening, before) = (Flattening::NONE, Some(chosen.model));
+        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, before, ..shown };
         (chosen, notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
         let what = format!("{} passes of the scan moved onto each other", passes.len());
         chosen.decisions.push(Decision { what, bend: None, gain, kept: true });

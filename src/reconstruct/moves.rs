@@ -168,6 +168,15 @@ pub fn is_one(model: &TubeModel, i: usize) -> bool {
         && (one.radius_mm / other.radius_mm).ln().abs() < SAME_RADIUS
 }
 
+/// A bend as one with the nearer of its neighbours that it touches, if it touches one.
+pub fn joined(model: &TubeModel, bend: usize) -> Option<TubeModel> {
+    let length_mm = |i: &usize| model.lra.bends[*i].length_mm;
+    let touching = (bend.max(1)..model.lra.bends.len().min(bend + 2))
+        .filter(|i| length_mm(i) < NO_STRAIGHT * model.tube_radius_mm);
+    let nearest = touching.min_by(|a, b| length_mm(a).total_cmp(&length_mm(b)))?;
+    merged(model, nearest).map(TubeModel::settled)
+}
+
 /// Bends `i - 1` and `i` as one: an arc over both when they turn in about one plane the same way, or, shallow ones in any
 /// planes, their joint turn in between.
 pub fn merged(model: &TubeModel, i: usize) -> Option<TubeModel> {

@@ -155,7 +155,13 @@ fn at_radius(cloud: &PointCloud, rest: &Moderate, faces: &[Face], candidate: &Ca
 fn chains(spine: &[SpinePoint], radius_mm: f64) -> Vec<Vec<Point3<f64>>> {
     let spacing = SPINE_SPACING_RADII * radius_mm;
     let chains = crust::connect(&mls::condense(spine, spacing), spacing, radius_mm);
-    chains.into_iter().map(|chain| crust::trimmed(chain, spacing, radius_mm)).collect()
+    let sound = |chain| {
+        let trimmed = |chain| crust::trimmed(chain, spacing, radius_mm);
+        let chain = trimmed(crust::without_scraps(chain, spacing, radius_mm));
+        // What was within may now be a scrap at an end.
+        trimmed(crust::opened(chain, spacing, radius_mm))
+    };
+    chains.into_iter().map(sound).collect()
 }
 
 /// What is missing where a radius is sure and no tube was found with it.

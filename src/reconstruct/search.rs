@@ -54,7 +54,7 @@ const STRAIGHT_RADII: f64 = 0.005;
 const DEAREST_NONE: f64 = 3.0;
 
 /// An angle within so many standard deviations of zero is not known.
-const UNSURE: f64 = 2.0;
+pub(super) const UNSURE: f64 = 2.0;
 
 /// Steps of a fit, and of one that only has to show whether a change is worth it.
 pub(super) const FULL_STEPS: usize = 100;

@@ -2,7 +2,7 @@
 //! the best of them [searched](super::search) for better ones; one die's radius for all bends where the data agrees; and
 //! what neither the points nor more than the passes' disagreement confirm left out.
 
-use nalgebra::Point3;
+use nalgebra::{Cholesky, DMatrix, Point3};
 use rayon::prelude::*;
 
 use super::arcline::{Limits, approximate};
@@ -23,7 +23,7 @@ use super::sections::CentreLine;
 use super::simplify::simplify;
 use super::strangers::Crowded;
 use super::stripes;
-use super::undecided::{self, Undecided};
+use super::undecided::{self, Own, Undecided};
 use super::whole::Whole;
 use crate::cloud::PointCloud;
 use crate::tube::Decision;
@@ -120,6 +120,13 @@ pub struct Structure {
     pub undecided: Undecided,
     /// How it came about, and what was turned down at the end.
     pub decisions: Vec<Decision>,
+}
+
+impl Structure {
+    /// The same with another tube that has fewer bends.
+    pub fn with_fewer_bends(&self, model: TubeModel) -> Structure {
+        Structure { model, undecided: Undecided::new(), ..self.clone() }
+    }
 }
 
 /// Finds the structure: the best of all candidates, or None when the polygon carries none.
@@ -227,16 +234,38 @@ impl Jury {
         let near = behind < DEAREST_COMMON * self.price(5, 1);
         let searched = if near { self.search(common) } else { common };
         let (searched, best_now) = (self.judge(searched.model), self.judge(best.model.clone()));
-        let gain = best_now.score - searched.score;
+        let solved = Solved::new(&self.line, &best_now.model, &best_now.parameters, self.prior);
+        let covariance = solved.inverse * (self.line.noise_mm.powi(2) * self.correlation);
+        let gain = self.one_die(&searched, &best_now, &covariance);
         let what = "one CLR for all bends".to_owned();
         if gain > 0.0 {
             self.decide(what, None, gain, true);
-            self.undecided = undecided::between(&searched.model, &best_now.model, gain);
+            let (model, parameters) = (&best_now.model, &best_now.parameters[..]);
+            let own = Own { model, gain, parameters, covariance: &covariance };
+            self.undecided = undecided::between(&searched.model, &own);
             return searched;
         }
         (self.decisions, self.correlation) = (before, correlation);
         self.decide(what, None, gain, false);
         best
+    }
+
+    /// By how much one CLR for all bends is better than their own, which have this covariance. An information criterion
+    /// takes a CLR more for as dear as if nothing at all were known of it beforehand; but a CLR is about as large as the others, and one
+    /// that the points tell no better than that is no news: it speaks neither for one die nor against it.
+    fn one_die(&self, one: &Candidate, own: &Candidate, covariance: &DMatrix<f64>) -> f64 {
+        let gain = own.score - one.score;
+        let Some(prior) = self.prior.filter(|_| one.bends() == own.bends()) else { return gain };
+        let at: Vec<usize> = undecided::radii(&own.parameters).map(|(j, _)| j).collect();
+        // As the score counts what is expected.
+        let spread_mm2 = prior.spread_mm.powi(2) * self.correlation;
+        let known = covariance.select_rows(&at).select_columns(&at) / spread_mm2;
+        let Some(known) = Cholesky::new(known) else { return gain };
+        let information = -2.0 * known.l().diagonal().map(f64::ln);
+        // The one CLR is about as well known as the best of them.
+        let occam = information.sum() - information.max();
+        let price = |c: &Candidate| self.price(c.parameters.len(), c.bends());
+        gain - price(own) + price(one) + occam
     }
 
     /// The tube without a row of bends that leads back onto the line before it, where the points are as well explained without:
@@ -325,7 +354,7 @@ impl Jury {
         let (mut best, mut score) = self.fit_walls(&mut sample, &model);
         let other = other.map(|model| self.fit_walls(&mut sample, &model)).filter(|o| o.1 < score);
         if let Some(other) = other {
-            self.decide("the tube as found without flat walls".to_owned(), None, score - other.1, true);
+            self.decide("the tube as found before".to_owned(), None, score - other.1, true);
             self.line = CentreLine::measure(points, &other.0.model, true);
             (best, score) = other;
         }
