@@ -108,6 +108,106 @@ fn an_angle_error_is_corrected_where_it_is() {
     assert!(reason.text.contains("43.50 instead of 45.00"), "{}", reason.text);
 }
 
+/// Another scan of the tube before.
+fn rescan(part: Part) -> Part {
+    Part { rescan: true, ..part }
+}
+
+#[test]
+fn an_odd_angle_counts_when_a_second_scan_of_the_tube_shows_it_too_and_not_when_it_does_not() {
+    let table = first_table();
+    let short = |id: &str| part(&table, measured(&off(&[(2, -1.5)]), 0.03), id);
+    let right = |id: &str| part(&table, measured(&bracket().lra, 0.03), id);
+    let confirmed = ask(&history(vec![short("a"), rescan(short("b"))]));
+    assert_eq!(confirmed.verdict, Verdict::Correct);
+    assert!(deg(confirmed.commanded.bends[1].angle_rad - table.bends[1].angle_rad) > 0.5);
+    let settled = ask(&history(vec![short("a"), rescan(right("b"))]));
+    assert_eq!(settled.verdict, Verdict::InTolerance, "{:?}", settled.reasons);
+}
+
+#[test]
+fn scans_of_one_tube_teach_as_one_tube() {
+    let table = first_table();
+    let seen = |id: &str| part(&table, measured(&off(&[(1, -0.2), (3, 0.2)]), 0.05), id);
+    let sigma = |parts| ask(&history(parts)).springback_sigma_deg[0];
+    let (one, again) = (sigma(vec![seen("a")]), sigma(vec![seen("a"), rescan(seen("b"))]));
+    let two = sigma(vec![seen("a"), seen("b")]);
+    assert!(two < again && again <= one, "one {one}, scanned twice {again}, two tubes {two}");
+}
+
+#[test]
+fn a_rescan_of_nothing_is_refused() {
+    let one = rescan(part(&first_table(), measured(&bracket().lra, 0.03), "a"));
+    let error = history(vec![one]).validate().unwrap_err();
+    assert!(error.part == 1 && error.detail.contains("rescan"), "{error}");
+}
+
+/// Tubes that spring back by other shares of what the table expects of them.
+fn sprung(table: &CommandTable, shares: &[f64]) -> Vec<Part> {
+    let expected = ask(&history(vec![])).springback_deg;
+    let tube = |(k, share): (usize, &f64)| {
+        let mut lra = bracket().lra;
+        for (i, bend) in lra.bends.iter_mut().enumerate() {
+            bend.angle_rad = table.bends[i].angle_rad - share * expected[i].to_radians();
+        }
+        part(table, measured(&lra, 0.03), &format!("{k}"))
+    };
+    shares.iter().enumerate().map(tube).collect()
+}
+
+#[test]
+fn tubes_that_suddenly_spring_back_otherwise_are_held_with_the_table_that_suits_them() {
+    let table = first_table();
+    let answer = ask(&history(sprung(&table, &[1.0, 1.0, 1.0, 1.4])));
+    assert_eq!(
+        (answer.verdict, codes(&answer)[0]),
+        (Verdict::Hold, Code::BatchChanged),
+        "{:?}",
+        answer.reasons
+    );
+    let more = deg(answer.commanded.bends[0].angle_rad - table.bends[0].angle_rad);
+    assert!((0.5..1.3).contains(&more), "the table proposed: {more}");
+    // Approved: the next tube, bent with it and right, is in tolerance and asks nothing.
+    let mut parts = sprung(&table, &[1.0, 1.0, 1.0, 1.4]);
+    parts.push(part(&answer.commanded, measured(&bracket().lra, 0.03), "next"));
+    assert_eq!(ask(&history(parts)).verdict, Verdict::InTolerance);
+}
+
+#[test]
+fn tubes_that_scatter_are_no_change() {
+    let answer = ask(&history(sprung(&first_table(), &[1.0, 1.01, 0.99, 1.02, 0.985])));
+    assert_ne!(answer.verdict, Verdict::Hold, "{:?}", answer.reasons);
+}
+
+#[test]
+fn a_tube_bent_with_the_table_before_is_held() {
+    let table = first_table();
+    let first = sprung(&table, &[1.6]).remove(0);
+    let corrected = ask(&history(vec![first.clone()])).commanded;
+    assert!(deg(corrected.bends[0].angle_rad - table.bends[0].angle_rad) > 0.7);
+    // Shown as one of the new table, but as the old one bends it.
+    let again = Part { commanded: corrected, scan_id: Some("again".into()), ..first.clone() };
+    let answer = ask(&history(vec![first, again]));
+    assert_eq!((answer.verdict, codes(&answer)[0]), (Verdict::Hold, Code::Revision), "{:?}", answer.reasons);
+}
+
+#[test]
+fn revisions_are_one_table_each_and_only_grow() {
+    let table = first_table();
+    let mut other = table.clone();
+    other.bends[0].angle_rad += 0.01;
+    let bent = |table: &CommandTable, revision, id: &str| Part {
+        revision: Some(revision),
+        ..part(table, measured(&bracket().lra, 0.03), id)
+    };
+    for second in [bent(&other, 3, "b"), bent(&other, 2, "b")] {
+        let answer = ask(&history(vec![bent(&table, 3, "a"), second]));
+        assert_eq!((answer.verdict, codes(&answer)[0]), (Verdict::Hold, Code::Revision));
+    }
+    let answer = ask(&history(vec![bent(&table, 3, "a"), bent(&other, 4, "b")]));
+    assert_eq!(answer.verdict, Verdict::InTolerance);
+}
+
 #[test]
 fn an_angle_error_is_no_feed_error() {
     // A bend formed short pulls its corners in, though every feed was right: no feed may answer to it.

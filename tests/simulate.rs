@@ -1,4 +1,4 @@
-//! `benderd simulate scan` as its user runs it.
+//! `benderd simulate scan` and `simulate production` as their user runs them.
 
 use std::path::Path;
 
@@ -61,4 +61,37 @@ fn unusable_arguments_end_with_status_2_and_a_reason() {
         assert!(said.contains(reason), "{reason} is missing in {said}");
         assert!(!out.exists());
     }
+}
+
+fn production(more: &[&str]) -> assert_cmd::assert::Assert {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_benderd"));
+    command
+        .args(["simulate", "production", "--part", PART, "--jobs", "100", "--seed", "5"])
+        .args(more)
+        .assert()
+}
+
+#[test]
+fn simulated_production_is_good_from_the_second_tube_on_and_meets_every_mix_up() {
+    let said = production(&["--faults", "--json"]).success().get_output().stdout.clone();
+    let found: serde_json::Value = serde_json::from_slice(&said).unwrap();
+    let good = |tube: usize| found["tubes"][tube]["good_percent"].as_f64().unwrap();
+    assert!(good(0) < 80.0 && good(1) > 90.0 && good(3) > 95.0, "{found}");
+    assert!(found["false_holds_percent"].as_f64().unwrap() < 0.5, "{found}");
+    let mix_ups = found["mix_ups"].as_object().unwrap();
+    assert!(mix_ups.len() == 7 && mix_ups.values().all(|met| met["missed"] == 0), "{mix_ups:?}");
+    let again = production(&["--faults", "--json"]).success().get_output().stdout.clone();
+    assert_eq!(said, again, "same seed, same jobs");
+}
+
+#[test]
+fn simulated_production_is_told_in_words_and_unknown_materials_are_refused() {
+    let said = String::from_utf8(production(&[]).success().get_output().stdout.clone()).unwrap();
+    assert!(
+        said.contains("100 jobs of bracket-17 in 304, seed 5") && said.contains("scrap before it"),
+        "{said}"
+    );
+    let error = production(&["--material", "cheese"]).code(2).get_output().stderr.clone();
+    let error = String::from_utf8(error).unwrap();
+    assert!(error.contains("cheese") && error.contains("ti-3al-2.5v"), "{error}");
 }
