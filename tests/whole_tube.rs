@@ -169,8 +169,8 @@ fn keeps_the_table(answer: &Answer, history: &History) -> bool {
 
 #[test]
 fn a_machine_of_whole_degrees_is_told_a_far_better_table_of_two_metres() {
-    told_better(&two_metres(), 0.6);
-    told_better(&stretched(), 0.6);
+    told_better(&two_metres(), 0.7);
+    told_better(&stretched(), 0.7);
 }
 
 fn told_better(nominal: &Nominal, share: f64) {
