@@ -78,7 +78,7 @@ const HEAD: &str = "| line | tube | angles 0.3 deg | 0.5 deg | lateral 1 mm | sp
 | --- | --- | --- | --- | --- | --- | --- | --- | --: | --: | --: |";
 
 fn row(line: &str, tube: &str, of: &[Figures; 4]) {
-    let each = |value: &dyn Fn(&Figures) -> String| of.each_ref().map(|f| value(f)).join(" / ");
+    let each = |value: &dyn Fn(&Figures) -> String| of.each_ref().map(value).join(" / ");
     let share = |value: &dyn Fn(&Figures) -> f64| each(&|f| format!("{:.1}", value(f)));
     println!(
         "| {line} | {tube} | {} | {} | {} | {} | {} | {} | {:.1} | {:.2} | {:.1} |",
