@@ -11,9 +11,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use benderd::config::{Materials, load_part};
-use benderd::correct::{History, Knowledge, Limits, Part, SetUp, learn, step, store};
+use benderd::correct::{History, Knowledge, Limits, SetUp, learn, store};
 use benderd::sim::forming::Plant;
-use benderd::trial::production::scanner::Scanner;
+use benderd::trial::production::bent;
 
 /// The plant's, so that the same arguments give the same file.
 const SEED: u64 = 3;
@@ -33,22 +33,8 @@ fn main() -> anyhow::Result<()> {
     let (mut plant, mut rng) = (Plant::new(&nominal, SEED), ChaCha8Rng::seed_from_u64(SEED));
     for (number, parts) in (1..).zip(jobs) {
         let key = SetUp { bender: "b1".to_owned(), lubrication: "std".to_owned() };
-        let mut history = History { key, batch: Some(format!("h{}", 76 + number)), parts: Vec::new() };
-        for k in 0..parts {
-            let answer = step(&nominal, &history, &known, &limits);
-            let formed = plant.bend(&answer.commanded, nominal.lra.developed_length_mm());
-            let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut rng);
-            let scan_id = Some(format!("job {number}, tube {}", k + 1));
-            let commanded = answer.commanded;
-            history.parts.push(Part {
-                commanded,
-                measured,
-                revision: None,
-                scan_id,
-                cut_length_mm: None,
-                rescan: false,
-            });
-        }
+        let begun = History { key, batch: Some(format!("h{}", 76 + number)), parts: Vec::new() };
+        let history = bent(&format!("job {number}"), &nominal, &mut plant, &known, begun, parts, &mut rng);
         known = learn(&nominal, &history, &known, &limits);
         plant.new_batch();
         plant.new_program(&nominal);
