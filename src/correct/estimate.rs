@@ -189,8 +189,9 @@ impl Springback {
     }
 
     /// Whether all bends together spring back by another factor than they did: both possibilities are weighed by what they make of
-    /// this part (G. A. Ackerson and K. S. Fu 1970). Comes first: bends that changed together must not pass for single ones that are
-    /// wrong; and those that are, far from the bends' median, have no say. None where nothing was known that could have changed.
+    /// this part (generalised pseudo-Bayes of first order, G. A. Ackerson and K. S. Fu 1970). Comes first: bends that changed
+    /// together must not pass for single ones that are wrong; and those that are, far from the bends' median, have no say. None where
+    /// nothing was known that could have changed.
     fn change_seen(&mut self, seen: &Seen) -> Option<Change> {
         let knew = std::mem::replace(&mut self.has_learned, true);
         if seen.rows.is_empty() || !knew {
