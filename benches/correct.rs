@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use benderd::correct::{History, Knowledge, Limits, learn, step};
 use benderd::sim::forming::Plant;
-use benderd::trial::production::bent;
+use benderd::trial::production::stand::Stand;
 use benderd::tube::{Bend, Lra, Nominal};
 
 const BENDS: u32 = 15;
@@ -31,10 +31,9 @@ fn part() -> Nominal {
 
 /// A job of so many parts, each bent with the table of the step before.
 fn job(nominal: &Nominal, parts: usize, knowledge: &Knowledge, seed: u64) -> History {
-    let mut plant = Plant::new(nominal, seed);
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let (plant, rng) = (Plant::new(nominal, seed), ChaCha8Rng::seed_from_u64(seed));
     let begun = History { batch: Some(format!("batch {}", seed % 3)), ..History::default() };
-    bent(&seed.to_string(), nominal, &mut plant, knowledge, begun, parts, &mut rng)
+    Stand { plant, rng }.job(&seed.to_string(), nominal, knowledge, begun, parts)
 }
 
 fn main() {
