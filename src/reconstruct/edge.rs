@@ -94,6 +94,11 @@ impl Edge {
         Edge { points, ..*self }
     }
 
+    /// The same points past the slope of an edge that was found: along it they stop as at a square cut.
+    pub fn along(&self, edge: &Estimate) -> Edge {
+        self.sloped(&edge.value, EVERYWHERE)
+    }
+
     /// The edge wherever the points say, close to a slope.
     pub fn free(&self, near: [f64; 2]) -> Option<Estimate> {
         // At 45 degrees it begins and ends a radius from where it meets the axis.

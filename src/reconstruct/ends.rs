@@ -30,6 +30,8 @@ const BEYOND_RADII: f64 = 0.15;
 /// An outline more oblique than any saw's by so many standard deviations is the shadow of another leg, or where the scan
 /// stops: these come as often as a saw that is set to its last degree.
 const OBLIQUE_SIGMAS: f64 = 1.5;
+/// Fewest points of a face that the outline does not lead to.
+const LEAST_FACE: usize = 60;
 /// What differs by more than this many standard deviations is not the same.
 const DIFFERENT_SIGMAS: f64 = 4.0;
 
@@ -95,7 +97,7 @@ pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_
     let about =
         if oblique { (outline.loose_at_mm, outline.loose_slope) } else { (outline.at_mm, outline.slope) };
     let steepest = STEEPEST_FACES[usize::from(oblique)];
-    let face = face::find(&inner, radius_mm, noise_mm, &Search { about_mm: about.0, near_mm, steepest });
+    let near = Search { about_mm: about.0, near_mm, steepest };
     let same = |f: &Face| {
         let room = near_mm / radius_mm;
         let off = |k: usize, v: f64| {
@@ -104,7 +106,17 @@ pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_
         };
         off(0, outline.slope_variance[0]) && off(1, outline.slope_variance[2])
     };
-    if let Some(face) = face.filter(same) {
+    // An outline of which half is hidden may be far off; a face that is seen all around and has nothing before it is the end.
+    let anywhere = Search {
+        about_mm: outline.at_mm,
+        near_mm: near_mm + MOST_OBLIQUE * radius_mm,
+        steepest: MOST_OBLIQUE,
+    };
+    let is_last =
+        |f: &Face| f.points >= LEAST_FACE && !goes_on(&surface, (f.at_mm, f.slope), radius_mm, near_mm);
+    let look = |search: &Search| face::find(&inner, radius_mm, noise_mm, search);
+    let face = look(&near).filter(same).or_else(|| look(&anywhere).filter(is_last));
+    if let Some(face) = face {
         let sigma_mm = face.covariance[(0, 0)].sqrt();
         if sigma_mm < outline.sigma_mm {
             let variance = [face.covariance[(1, 1)], face.covariance[(1, 2)], face.covariance[(2, 2)]];
@@ -113,19 +125,24 @@ pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_
             return Some(End::Found(Place { at_mm: face.at_mm, sigma_mm, cut_rad, by_outline: false }));
         }
     }
-    if goes_on(&surface, &outline, radius_mm, near_mm) {
+    if goes_on(&surface, (outline.at_mm, outline.slope), radius_mm, near_mm) {
         return Some(End::Ragged { at_mm: outline.at_mm });
     }
     Some(by_outline(&outline, noise_mm))
 }
 
-/// Whether the outside goes on past the outline somewhere: then it is that of a jaw that hides the rest, or of a patch
-/// that was not scanned.
-fn goes_on(surface: &[Point3<f64>], outline: &Outline, radius_mm: f64, near_mm: f64) -> bool {
+/// Whether the outside goes on past a plane (where on the axis, slope) somewhere: an outline is then that of a jaw that hides
+/// the rest, or of a patch that was not scanned.
+fn goes_on(
+    surface: &[Point3<f64>],
+    (at_mm, slope): (f64, [f64; 2]),
+    radius_mm: f64,
+    near_mm: f64,
+) -> bool {
     let beyond_mm = near_mm.max(BEYOND_RADII * radius_mm);
     let (mut before, mut beyond) = (0, 0);
     for p in surface {
-        let x = p.x - outline.at_mm - outline.slope[0] * p.y - outline.slope[1] * p.z;
+        let x = p.x - at_mm - slope[0] * p.y - slope[1] * p.z;
         before += usize::from((0.0..radius_mm).contains(&x));
         beyond += usize::from((-radius_mm..0.0).contains(&(x + beyond_mm)));
     }
