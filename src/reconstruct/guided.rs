@@ -242,8 +242,19 @@ impl Guided {
                 }
             }
         }
-        let correlation = line.correlation(&best.model);
-        best = fitted(&line, best.model, prior, correlation, AS_IT_IS);
+        Some(Guided::of(line, best.model, prior, part, reversed))
+    }
+
+    /// The nominal's structure as it was fitted to the sections.
+    fn of(
+        line: CentreLine,
+        model: TubeModel,
+        prior: Option<RadiusPrior>,
+        part: Lra,
+        reversed: bool,
+    ) -> Guided {
+        let correlation = line.correlation(&model);
+        let mut best = fitted(&line, model, prior, correlation, AS_IT_IS);
         if has_common_radius(&part) && part.bends.len() > 1 {
             let common = fitted(&line, with_common_radius(&best.model), prior, correlation, FULLY);
             best = if common.score < best.score { common } else { best };
@@ -254,7 +265,7 @@ impl Guided {
         let mut covariance = &solved.inverse * variance;
         held.iter().for_each(|h| hold(&mut covariance, &best.parameters, h));
         let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
-        Some(Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved })
+        Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved }
     }
 
     /// The structure; of a large cloud fitted to the sample's own points, from where the fit to all is a step or two.

@@ -62,7 +62,12 @@ impl Guided {
         let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
         let spared = formed && mine.score - saved <= other.score;
         let gain = other.score - mine.score;
-        let mine_is_kept = || (told(self.structure(shown), KEPT, gain, true), self.resting());
+        // As fitted beside the scan's own: its own fit may have lost its way.
+        let mine_is_kept = || {
+            let found =
+                Guided::of(line.clone(), mine.model.clone(), self.prior, self.part.clone(), self.reversed);
+            (told(found.structure(shown), KEPT, gain, true), found.resting())
+        };
         if sure && (mine.score <= other.score || spared) {
             return mine_is_kept();
         }
