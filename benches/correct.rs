@@ -7,9 +7,9 @@ use criterion::{BenchmarkId, Criterion};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use benderd::correct::{History, Knowledge, Limits, Part, learn, step};
+use benderd::correct::{History, Knowledge, Limits, learn, step};
 use benderd::sim::forming::Plant;
-use benderd::trial::production::scanner::Scanner;
+use benderd::trial::production::stand::Stand;
 use benderd::tube::{Bend, Lra, Nominal};
 
 const BENDS: u32 = 15;
@@ -31,24 +31,9 @@ fn part() -> Nominal {
 
 /// A job of so many parts, each bent with the table of the step before.
 fn job(nominal: &Nominal, parts: usize, knowledge: &Knowledge, seed: u64) -> History {
-    let mut plant = Plant::new(nominal, seed);
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut history = History { batch: Some(format!("batch {}", seed % 3)), ..History::default() };
-    for k in 0..parts {
-        let commanded = step(nominal, &history, knowledge, &Limits::default()).commanded;
-        let formed = plant.bend(&commanded, nominal.lra.developed_length_mm());
-        let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut rng);
-        let scan_id = Some(format!("{seed}-{k}"));
-        history.parts.push(Part {
-            commanded,
-            measured,
-            revision: None,
-            scan_id,
-            cut_length_mm: None,
-            rescan: false,
-        });
-    }
-    history
+    let (plant, rng) = (Plant::new(nominal, seed), ChaCha8Rng::seed_from_u64(seed));
+    let begun = History { batch: Some(format!("batch {}", seed % 3)), ..History::default() };
+    Stand { plant, rng }.job(&seed.to_string(), nominal, knowledge, begun, parts)
 }
 
 fn main() {

@@ -11,9 +11,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use benderd::config::{Materials, load_part};
-use benderd::correct::{History, Knowledge, Limits, Part, SetUp, learn, step, store};
+use benderd::correct::{History, Knowledge, Limits, SetUp, learn, store};
 use benderd::sim::forming::Plant;
-use benderd::trial::production::scanner::Scanner;
+use benderd::trial::production::stand::Stand;
 
 /// The plant's, so that the same arguments give the same file.
 const SEED: u64 = 3;
@@ -30,28 +30,14 @@ fn main() -> anyhow::Result<()> {
     let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
     let nominal = load_part(&root.join("config/parts/bracket-17.toml"), &Materials::shipped()?)?;
     let (limits, mut known) = (Limits::default(), Knowledge::default());
-    let (mut plant, mut rng) = (Plant::new(&nominal, SEED), ChaCha8Rng::seed_from_u64(SEED));
+    let mut stand = Stand { plant: Plant::new(&nominal, SEED), rng: ChaCha8Rng::seed_from_u64(SEED) };
     for (number, parts) in (1..).zip(jobs) {
         let key = SetUp { bender: "b1".to_owned(), lubrication: "std".to_owned() };
-        let mut history = History { key, batch: Some(format!("h{}", 76 + number)), parts: Vec::new() };
-        for k in 0..parts {
-            let answer = step(&nominal, &history, &known, &limits);
-            let formed = plant.bend(&answer.commanded, nominal.lra.developed_length_mm());
-            let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut rng);
-            let scan_id = Some(format!("job {number}, tube {}", k + 1));
-            let commanded = answer.commanded;
-            history.parts.push(Part {
-                commanded,
-                measured,
-                revision: None,
-                scan_id,
-                cut_length_mm: None,
-                rescan: false,
-            });
-        }
+        let begun = History { key, batch: Some(format!("h{}", 76 + number)), parts: Vec::new() };
+        let history = stand.job(&format!("job {number}"), &nominal, &known, begun, parts);
         known = learn(&nominal, &history, &known, &limits);
-        plant.new_batch();
-        plant.new_program(&nominal);
+        stand.plant.new_batch();
+        stand.plant.new_program(&nominal);
     }
     store::save(&path, &known)?;
     println!("{}: {} jobs", path.display(), known.keys.iter().map(|k| k.jobs.len()).sum::<usize>());

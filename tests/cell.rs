@@ -371,6 +371,23 @@ fn a_part_that_was_held_has_no_say() {
 }
 
 #[test]
+fn a_changed_batch_begins_with_the_tube_that_showed_it() {
+    let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
+    b.decide(Verdict::InTolerance);
+    b.on(Event::Scan(scan()));
+    b.read(2);
+    b.on(Event::Measured(b.ticket, tube()));
+    assert_eq!(b.cell.history().len(), 2);
+    let mut held = decision(Verdict::Hold);
+    held.answer.reasons = vec![Reason::new(Code::BatchChanged, "another batch")];
+    b.on(Event::Decided(b.ticket, held));
+    assert_eq!((name(b.cell.state()).as_str(), b.cell.history().len()), ("Held", 1));
+    b.on(Event::Arm);
+    b.read(2);
+    assert_eq!((name(b.cell.state()).as_str(), b.cell.history().len()), ("Deciding(first piece)", 1));
+}
+
+#[test]
 fn a_tube_that_is_scanned_again_stays_one_tube() {
     let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
     b.decide(Verdict::Rescan);

@@ -140,6 +140,12 @@ fn a_rescan_of_nothing_is_refused() {
     let one = rescan(part(&first_table(), measured(&bracket().lra, 0.03), "a"));
     let error = history(vec![one]).validate().unwrap_err();
     assert!(error.part == 1 && error.detail.contains("rescan"), "{error}");
+    // Nor is it one of a tube that was bent with another table.
+    let (table, mut other) = (first_table(), first_table());
+    other.bends[0].angle_rad += 0.01;
+    let of = |table: &CommandTable, id: &str| part(table, measured(&bracket().lra, 0.03), id);
+    let error = history(vec![of(&table, "a"), rescan(of(&other, "b"))]).validate().unwrap_err();
+    assert!(error.part == 2 && error.detail.contains("same table"), "{error}");
 }
 
 /// Tubes that spring back by other shares of what the table expects of them.
@@ -167,6 +173,7 @@ fn tubes_that_suddenly_spring_back_otherwise_are_held_with_the_table_that_suits_
     );
     let more = deg(answer.commanded.bends[0].angle_rad - table.bends[0].angle_rad);
     assert!((0.5..1.3).contains(&more), "the table proposed: {more}");
+    assert!(answer.predicted.is_some(), "what is proposed is foretold");
     // Approved: the next tube, bent with it and right, is in tolerance and asks nothing.
     let mut parts = sprung(&table, &[1.0, 1.0, 1.0, 1.4]);
     parts.push(part(&answer.commanded, measured(&bracket().lra, 0.03), "next"));

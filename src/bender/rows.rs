@@ -4,7 +4,7 @@
 //! steps off at the end. An angle stands for itself: what one bend lacks is not made up for by another.
 
 use super::profile::{Sequence, TableFormat};
-use crate::tube::{CommandRow, CommandTable};
+use crate::tube::{CommandRow, CommandTable, WholeSteps};
 
 /// One row: what the machine moves by, and the numbers that it takes (the same, or positions).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,22 +53,17 @@ pub fn rows_of(format: &TableFormat, numbers: &[[i32; 3]]) -> Vec<CommandRow> {
 /// One column, from the first row on.
 struct Column {
     sequence: Sequence,
-    /// Where the machine should be, and where whole steps bring it.
-    wanted: f64,
-    reached: f64,
+    steps: WholeSteps,
 }
 
 impl Column {
     fn new(sequence: Sequence) -> Column {
-        Column { sequence, wanted: 0.0, reached: 0.0 }
+        Column { sequence, steps: WholeSteps::default() }
     }
 
     /// What it moves by, and the number that says so.
     fn next(&mut self, steps: f64) -> (f64, f64) {
-        self.wanted += steps;
-        // Rounded in one direction everywhere: a whole number of steps stays that number wherever it begins.
-        let position = (self.wanted + 0.5).floor();
-        let moved = position - std::mem::replace(&mut self.reached, position);
+        let (moved, position) = self.steps.next(steps);
         (moved, if self.sequence == Sequence::Cumulative { position } else { moved })
     }
 }

@@ -7,7 +7,7 @@ use anyhow::Context;
 use super::{Outcome, say};
 use crate::bender::Profile;
 use crate::config::{Materials, load_part};
-use crate::correct::{Answer, History, Knowledge, Limits, Predicted, Verdict, learn, step, store};
+use crate::correct::{Answer, Code, History, Knowledge, Limits, Predicted, Verdict, learn, step, store};
 use crate::tube::MachineLimits;
 
 /// Arguments of `benderd correct`.
@@ -91,6 +91,9 @@ fn table(answer: &Answer) -> String {
             Verdict::InTolerance => "in tolerance: keep this table",
             Verdict::Correct => "correct: bend the next tube with this table and scan it",
             Verdict::Rescan => "rescan: scan the same tube again; the table stays",
+            Verdict::Hold if answer.is_about(Code::BatchChanged) => {
+                "hold: bend the next tube with this table only when the change is meant to stay"
+            }
             Verdict::Hold => "hold: nothing is sent before this is cleared; the table stays",
         }
         .to_owned(),

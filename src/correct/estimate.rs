@@ -26,7 +26,7 @@ const SHAPE_SIGMA: f64 = 0.1;
 /// Prior sigma of a bend's residual.
 const RESIDUAL_SIGMA_RAD: f64 = 0.10 * DEGREE;
 /// Scatter from bend to bend that no table can take out.
-const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
+pub(super) const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
 /// Scatter from tube to tube, common to its bends, as a share of the spring-back.
 const TUBE_SCATTER: f64 = 0.015;
 /// Drift of all of x together from part to part: without it the filter stays stuck after a change of material.
@@ -143,13 +143,24 @@ impl Springback {
         let (settled, open) = (self.belief.clone(), self.opened(1.0));
         // Bends are held against each other under what is likely of both.
         self.belief = self.opened(chance);
-        let all = || 0..measured.len();
-        let (mut heard, mut outliers, mut loose): (Vec<usize>, Vec<Outlier>, Vec<(usize, f64)>) =
-            (all().collect(), Vec::new(), Vec::new());
-        let mut before = std::mem::replace(&mut self.suspect, vec![false; measured.len()]);
+        let sorted = self.sort_out(&mut seen, agreed);
+        let heard = seen.of(&sorted.heard);
+        let updated = |mut belief: Belief| {
+            sorted.loose.iter().for_each(|(index, sigma)| belief.loosen(*index, *sigma));
+            belief.update(&heard.rows, &heard.found, &heard.noise());
+            belief
+        };
+        self.belief = updated(settled).mixed(&updated(open), chance);
+        sorted.outliers
+    }
+
+    /// Which bends are listened to. One after the other is left out, the worst first: it spoils what the others are held against.
+    fn sort_out(&mut self, seen: &mut Seen, agreed: &[usize]) -> Sorted {
+        let all = 0..agreed.len();
+        let (mut heard, mut outliers, mut loose) = (all.clone().collect::<Vec<_>>(), Vec::new(), Vec::new());
+        let mut before = std::mem::replace(&mut self.suspect, vec![false; agreed.len()]);
         before.iter_mut().zip(agreed).for_each(|(before, scans)| *before |= *scans > 1);
-        // One after the other, the worst first: it spoils what the others are held against.
-        while let Some(odd) = self.oddest(&seen, &heard) {
+        while let Some(odd) = self.oddest(seen, &heard) {
             let i = odd.bend;
             self.suspect[i] = true;
             heard.retain(|k| *k != i);
@@ -160,21 +171,14 @@ impl Springback {
                 outliers.push(odd);
             }
         }
-        for expected in self.others_say(&seen, &heard) {
+        for expected in self.others_say(seen, &heard) {
             let off = expected.off() / DOUBT;
             if off > 1.0 {
                 seen.variances[expected.bend] += expected.expected_rad.sigma.powi(2) * (off.powi(2) - 1.0);
             }
         }
-        heard.extend(all().filter(|&i| self.suspect[i] && before[i]));
-        let heard = seen.of(&heard);
-        let updated = |mut belief: Belief| {
-            loose.iter().for_each(|(index, sigma)| belief.loosen(*index, *sigma));
-            belief.update(&heard.rows, &heard.found, &heard.noise());
-            belief
-        };
-        self.belief = updated(settled).mixed(&updated(open), chance);
-        outliers
+        heard.extend(all.filter(|&i| self.suspect[i] && before[i]));
+        Sorted { heard, outliers, loose }
     }
 
     /// The belief if all of x had moved by [`CHANGE_SIGMA`], or with some chance has.
@@ -185,8 +189,9 @@ impl Springback {
     }
 
     /// Whether all bends together spring back by another factor than they did: both possibilities are weighed by what they make of
-    /// this part (G. A. Ackerson and K. S. Fu 1970). Comes first: bends that changed together must not pass for single ones that are
-    /// wrong; and those that are, far from the bends' median, have no say. None where nothing was known that could have changed.
+    /// this part (generalised pseudo-Bayes of first order, G. A. Ackerson and K. S. Fu 1970). Comes first: bends that changed
+    /// together must not pass for single ones that are wrong; and those that are, far from the bends' median, have no say. None where
+    /// nothing was known that could have changed.
     fn change_seen(&mut self, seen: &Seen) -> Option<Change> {
         let knew = std::mem::replace(&mut self.has_learned, true);
         if seen.rows.is_empty() || !knew {
@@ -318,6 +323,16 @@ impl Springback {
         row.rows_mut(0, 3).copy_from_slice(&[s90_rad, s90_rad * share, s90_rad * share.sqrt()]);
         row
     }
+}
+
+/// What becomes of a tube's bends.
+struct Sorted {
+    /// They are learned from.
+    heard: Vec<usize>,
+    /// They are not.
+    outliers: Vec<Outlier>,
+    /// What has changed: which unknown, and by how much it is open again.
+    loose: Vec<(usize, f64)>,
 }
 
 /// What one tube's bends show.

@@ -7,7 +7,8 @@
 use sha2::{Digest, Sha256};
 
 use super::Knowledge;
-use super::knowledge::{BEND_SCATTER_RAD, BendPoint, JobRecord};
+use super::estimate::BEND_SCATTER_RAD;
+use super::knowledge::{BendPoint, JobRecord};
 use crate::tube::deg::to_degrees_clean;
 use crate::tube::{SpringbackForm, SpringbackTable};
 

@@ -4,6 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::estimate::BEND_SCATTER_RAD;
 use super::history::{History, SetUp};
 use super::lengths::{Side, grown};
 use super::replay::Used;
@@ -208,9 +209,6 @@ fn turn_point(nominal: &Nominal, used: &[Used], bend: usize) -> Option<TurnPoint
     let ([off_rad], sigma_rad) = mean.finish()?;
     Some(TurnPoint { per_backlash, off_rad, sigma_rad })
 }
-
-/// Scatter of the single bend around its mean, for weighing.
-pub(super) const BEND_SCATTER_RAD: f64 = 0.08 * std::f64::consts::PI / 180.0;
 
 /// Mean of some values with common weights 1 / sigma^2.
 struct Mean<const N: usize> {

@@ -38,7 +38,7 @@ pub use plan::Limits;
 pub use predicted::{Predicted, PredictedPoint};
 pub use verdict::{Answer, Code, Reason, Verdict};
 
-use crate::inspect;
+use crate::inspect::{self, Inspection};
 use crate::tube::{CommandTable, MeasuredTube, Nominal};
 use predicted::foretold;
 use replay::{Job, Newest, Replay, Used, replay};
@@ -148,11 +148,23 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
         reasons.push(Reason::new(Code::Scatter, text));
         return answer(Verdict::Correct, in_force, replay, reasons);
     }
-    let sharper =
-        inspect::inspect(&trimmed(&scans::with_one_more(&newest.measured, newest.scans), nominal), nominal);
-    let could_decide = sharper.is_ok_and(|seen| seen.verdict != inspect::Verdict::Uncertain);
+    undecided(job, replay, newest, reasons, &inspection)
+}
+
+/// Neither good nor bad for certain, and nothing to change: scanned again where that can tell, else left as it is.
+fn undecided(
+    job: &Job,
+    replay: &Replay,
+    newest: &Used,
+    mut reasons: Vec<Reason>,
+    inspection: &Inspection,
+) -> Answer {
+    let in_force = newest.commanded.clone();
+    let sharper = trimmed(&scans::with_one_more(&newest.measured, newest.scans), job.nominal);
+    let could_decide =
+        inspect::inspect(&sharper, job.nominal).is_ok_and(|seen| seen.verdict != inspect::Verdict::Uncertain);
     if could_decide || !inspection.is_whole() {
-        reasons.push(Reason::new(Code::Unseen, inspection.advice));
+        reasons.push(Reason::new(Code::Unseen, inspection.advice.clone()));
         return answer(Verdict::Rescan, in_force, replay, reasons);
     }
     let text = format!(

@@ -96,7 +96,8 @@ pub fn replay(job: &Job, turn_newest: bool) -> Replay {
     let mut scans: Vec<MeasuredTube> = Vec::new();
     for (i, part) in history.parts.iter().enumerate() {
         let newest = i + 1 == history.parts.len();
-        let again = part.rescan && !scans.is_empty();
+        let same_table = out.used.last().is_some_and(|used| used.commanded == part.commanded);
+        let again = part.rescan && same_table && !scans.is_empty();
         match oriented(job, part, if again { &out.before } else { &out.model }, newest && turn_newest) {
             Ok((measured, ambiguous)) => {
                 scans.push(measured);

@@ -9,9 +9,6 @@ use crate::tube::{MeasuredTube, wrap_angle};
 /// Values that are farther apart than so many sigmas are not of the same thing.
 const APART: f64 = 5.0;
 
-/// Sigma of a value that came without one, in the value's own unit.
-const UNSTATED: f64 = 0.1;
-
 /// What several scans say together.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fused {
@@ -54,14 +51,14 @@ pub fn fused(scans: &[MeasuredTube]) -> Option<Fused> {
         if let Some(angle) = angle {
             (own.angle_rad, own.angle_sigma_rad) = (angle.value, angle.sigma);
         }
-        (own.length_mm, own.length_sigma_mm) = apart(length);
-        (own.radius_mm, own.radius_sigma_mm) = apart(radius);
+        put(length, &mut own.length_mm, &mut own.length_sigma_mm);
+        put(radius, &mut own.radius_mm, &mut own.radius_sigma_mm);
         if i > 0 {
-            (own.rotation_rad, own.rotation_sigma_rad) = apart(turn);
+            put(turn, &mut own.rotation_rad, &mut own.rotation_sigma_rad);
         }
     }
     let (last, _) = blend(&|s| known(s.last_length_mm, s.last_length_sigma_mm));
-    (out.last_length_mm, out.last_length_sigma_mm) = apart(last);
+    put(last, &mut out.last_length_mm, &mut out.last_length_sigma_mm);
     let corners = out.intersection_mm.len();
     out.intersection_sigma_mm.resize(corners, None);
     for j in 0..corners {
@@ -69,7 +66,7 @@ pub fn fused(scans: &[MeasuredTube]) -> Option<Fused> {
             let sigma = s.intersection_sigma_mm.get(j).copied().flatten();
             known(s.intersection_mm.get(j).copied().flatten(), sigma)
         });
-        (out.intersection_mm[j], out.intersection_sigma_mm[j]) = apart(corner);
+        put(corner, &mut out.intersection_mm[j], &mut out.intersection_sigma_mm[j]);
     }
     let odd = agreed.iter().filter(|agreed| **agreed < scans.len()).count();
     (3 * odd <= out.bends.len().max(3)).then_some(Fused { measured: out, agreed })
@@ -91,12 +88,16 @@ pub fn with_one_more(measured: &MeasuredTube, scans: usize) -> MeasuredTube {
     out
 }
 
+/// A value without its sigma (other programs' files) cannot be weighed against others.
 fn known(value: Option<f64>, sigma: Option<f64>) -> Option<Known> {
-    value.map(|value| Known { value, sigma: sigma.unwrap_or(UNSTATED) })
+    Some(Known { value: value?, sigma: sigma? })
 }
 
-fn apart(known: Option<Known>) -> (Option<f64>, Option<f64>) {
-    (known.map(|k| k.value), known.map(|k| k.sigma))
+/// Where nothing could be weighed the newest scan's stays.
+fn put(found: Option<Known>, value: &mut Option<f64>, sigma: &mut Option<f64>) {
+    if let Some(found) = found {
+        (*value, *sigma) = (Some(found.value), Some(found.sigma));
+    }
 }
 
 /// The largest number that agree with one of them; of equal numbers those with the newest.
@@ -159,6 +160,22 @@ mod tests {
         b.bends[1].rotation_rad = Some(-std::f64::consts::PI + 0.001);
         let turn = fused(&[a, b]).unwrap().measured.bends[1].rotation_rad.unwrap();
         assert!(wrap_angle(turn - std::f64::consts::PI).abs() < 1e-9, "{turn}");
+    }
+
+    /// Found: a turn that came without a sigma was known to 0.1 radians afterwards, and never corrected again.
+    #[test]
+    fn values_without_a_sigma_stay_the_newest_ones() {
+        let (mut a, mut b) = (scan([90.0, 45.0, 30.0], 100.0), scan([90.0, 45.0, 30.0], 100.2));
+        for measured in [&mut a, &mut b] {
+            measured.bends.iter_mut().for_each(|bend| {
+                (bend.rotation_sigma_rad, bend.length_sigma_mm) = (None, None);
+            });
+            measured.intersection_sigma_mm = Vec::new();
+        }
+        let out = fused(&[a, b.clone()]).unwrap().measured;
+        assert_eq!(out.bends[1].rotation_sigma_rad, None);
+        assert_eq!((out.bends[1].length_mm, out.bends[1].length_sigma_mm), (b.bends[1].length_mm, None));
+        assert_eq!(out.intersection_mm, b.intersection_mm);
     }
 
     #[test]

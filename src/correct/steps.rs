@@ -1,6 +1,6 @@
 //! Tables in the machine's whole steps, and tables that differ by them.
 
-use crate::tube::{CommandTable, MachineLimits};
+use crate::tube::{CommandTable, MachineLimits, WholeSteps};
 
 /// A table with these values.
 pub fn with(table: &CommandTable, values: impl Iterator<Item = f64>) -> CommandTable {
@@ -21,21 +21,15 @@ pub fn taken_from(in_force: &CommandTable, table: &CommandTable) -> CommandTable
 
 /// In the machine's whole steps, each value for itself, what is left over of lengths and rotations carried on: as the gate does.
 pub fn rounded(table: &CommandTable, machine: &MachineLimits) -> CommandTable {
-    let (mut feed, mut turn) = (0.0, 0.0);
-    let next = |value: f64, step: f64, left: &mut f64| {
-        if step <= 0.0 {
-            return value;
-        }
-        let wanted = value + *left;
-        let whole = (wanted / step + 0.5).floor() * step;
-        *left = wanted - whole;
-        whole
+    let (mut feed, mut turn) = (WholeSteps::default(), WholeSteps::default());
+    let next = |value: f64, step: f64, column: &mut WholeSteps| {
+        if step > 0.0 { column.next(value / step).0 * step } else { value }
     };
     let mut out = table.clone();
     for row in &mut out.bends {
         row.length_mm = next(row.length_mm, machine.length_resolution_mm, &mut feed);
         row.rotation_rad = next(row.rotation_rad, machine.angle_resolution_rad, &mut turn);
-        row.angle_rad = next(row.angle_rad, machine.angle_resolution_rad, &mut 0.0);
+        row.angle_rad = next(row.angle_rad, machine.angle_resolution_rad, &mut WholeSteps::default());
     }
     out
 }

@@ -127,15 +127,28 @@ fn heading<'a>(
     along.try_normalize(1e-12)
 }
 
+/// A gap between the end of one piece and the begin of another.
+struct Across {
+    /// The way that the one piece leaves.
+    out: Vector3<f64>,
+    /// The way that the other goes on.
+    on: Vector3<f64>,
+    /// From end to begin.
+    gap: Vector3<f64>,
+}
+
+impl Across {
+    /// None where a piece is too short to have a way.
+    fn of(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> Option<Across> {
+        let (from, to) = (before[before.len() - 1], behind[0]);
+        let back = heading(from, before.iter().rev(), radius_mm)?;
+        Some(Across { out: -back, on: heading(to, behind.iter(), radius_mm)?, gap: to - from })
+    }
+}
+
 /// Whether a straight or one bend leads from the end of one piece to the begin of another.
 fn is_across_one_bend(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> bool {
-    let (from, to) = (before[before.len() - 1], behind[0]);
-    let (Some(back), Some(on)) =
-        (heading(from, before.iter().rev(), radius_mm), heading(to, behind.iter(), radius_mm))
-    else {
-        return true;
-    };
-    let (out, gap) = (-back, to - from);
+    let Some(Across { out, on, gap }) = Across::of(before, behind, radius_mm) else { return true };
     let cos = out.dot(&on);
     let tangent_mm = TIGHTEST_RADII * radius_mm * ((1.0 - cos) / (1.0 + cos).max(1e-3)).sqrt();
     // The two lines are nearest to each other where the bend's corner is.
@@ -158,13 +171,7 @@ fn is_across_one_bend(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm:
 
 /// Whether a straight leads from the end of one piece to the begin of another.
 fn is_straight_across(before: &[Point3<f64>], behind: &[Point3<f64>], radius_mm: f64) -> bool {
-    let (from, to) = (before[before.len() - 1], behind[0]);
-    let (Some(back), Some(on)) =
-        (heading(from, before.iter().rev(), radius_mm), heading(to, behind.iter(), radius_mm))
-    else {
-        return false;
-    };
-    let (out, gap) = (-back, to - from);
+    let Some(Across { out, on, gap }) = Across::of(before, behind, radius_mm) else { return false };
     let slack_mm = SLACK_RADII * radius_mm + ASTRAY * gap.norm();
     out.dot(&on) > 0.0
         && gap.dot(&out) > 0.0
@@ -409,7 +416,7 @@ mod tests {
 
     #[test]
     fn pieces_joined_at_the_wrong_gap_are_opened_there() {
-        // Of a circle a tenth is missing, and a little opposite to it, where the chain begins.
+        // A hook in two pieces.
         let on = |from: Point3<f64>, way: Vector3<f64>, count: i32| {
             (0..count).map(move |i| from + way * f64::from(i))
         };

@@ -21,6 +21,25 @@ pub struct MachineLimits {
     pub angle_resolution_rad: f64,
 }
 
+/// One column of a table in whole steps: what a row's rounding leaves over goes into the next row's.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct WholeSteps {
+    /// Where the machine should be, in steps from the first row on.
+    wanted: f64,
+    /// Where whole steps bring it.
+    reached: f64,
+}
+
+impl WholeSteps {
+    /// Moves on by so many steps: the whole ones that it takes, and the position that they reach.
+    pub fn next(&mut self, steps: f64) -> (f64, f64) {
+        self.wanted += steps;
+        // Rounded in one direction everywhere: a whole number of steps stays that number wherever it begins.
+        let position = (self.wanted + 0.5).floor();
+        (position - std::mem::replace(&mut self.reached, position), position)
+    }
+}
+
 impl MachineLimits {
     /// No machine at all: what arithmetic allows. For planning before the machine is known.
     pub fn unlimited() -> MachineLimits {

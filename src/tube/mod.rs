@@ -16,7 +16,7 @@ mod springback;
 mod table;
 mod ybc;
 
-pub use limits::MachineLimits;
+pub use limits::{MachineLimits, WholeSteps};
 pub use lra::{Bend, Lra, TubeError, wrap_angle};
 pub use material::Material;
 pub use measured::{Decision, MeasuredBend, MeasuredTube};

@@ -10,8 +10,8 @@ use super::oracle::angles::Mishaps;
 use super::scanner::Scanner;
 use super::truth::Truth;
 use crate::correct::Verdict;
-use crate::sim::forming::{FormedTube, Plant, World};
-use crate::tube::{CommandTable, MeasuredTube, Nominal};
+use crate::sim::forming::{Plant, World};
+use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
 
 /// Scans of one tube, at most.
 const SCANS: usize = 3;
@@ -164,30 +164,18 @@ impl<'a> Job<'a> {
     /// Bends a tube, scans it as often as is asked for, and takes the next table.
     pub fn tube(&mut self, part: &Nominal) -> Tube {
         let formed = self.bend(part);
-        let truth = Truth::of(&formed.lra, part);
-        let possible = |which: &MixUp| *which != MixUp::WrongRevision || self.older.is_some();
-        let due = self.mix_up.filter(|(_, tube)| *tube == self.bent).map(|(which, _)| which);
-        let mix_up = due.filter(possible);
-        let mut met = None;
-        let mut again = 0;
-        let mut said = match mix_up {
-            Some(which) => {
-                let said = self.mixed_up(which, &formed, part);
-                met = said.verdict.map(|verdict| which.is_met_by(verdict));
-                again += 1;
-                if which.is_withdrawn() && said.verdict == Some(Verdict::Hold) {
-                    self.controller.withdraw();
-                    self.take(self.scan(&formed, part, again), again, false)
-                } else {
-                    said
-                }
-            }
-            None => self.take(self.scan(&formed, part, 0), 0, false),
+        let truth = Truth::of(&formed, part);
+        let mix_up = self.mix_up.filter(|(_, tube)| *tube == self.bent).map(|(which, _)| which);
+        // Where the table was never changed there is no older one.
+        let mix_up = mix_up.filter(|which| *which != MixUp::WrongRevision || self.older.is_some());
+        let (mut said, met) = match mix_up {
+            Some(which) => self.first_look(which, &formed, part),
+            None => (self.show(&formed, part, 0, false), None),
         };
         let mut scans = 1;
         while said.verdict == Some(Verdict::Rescan) && scans < SCANS {
-            again += 1;
-            said = self.take(self.scan(&formed, part, again), again, true);
+            // The second scan is kept for who looked at something else first.
+            said = self.show(&formed, part, scans + usize::from(mix_up.is_some()), true);
             scans += 1;
         }
         let held_falsely = said.verdict == Some(Verdict::Hold) && !self.has_changed();
@@ -196,43 +184,48 @@ impl<'a> Job<'a> {
         Tube { truth, good, verdict: said.verdict, scans, held_falsely, mix_up: mix_up.zip(met) }
     }
 
+    /// What is said of something mixed up, whether rightly; and of the tube itself where the former was withdrawn.
+    fn first_look(&mut self, which: MixUp, formed: &Lra, part: &Nominal) -> (Said, Option<bool>) {
+        let said = self.mixed_up(which, formed, part);
+        let met = said.verdict.map(|verdict| which.is_met_by(verdict));
+        if !which.is_withdrawn() || said.verdict != Some(Verdict::Hold) {
+            return (said, met);
+        }
+        self.controller.withdraw();
+        (self.show(formed, part, 1, false), met)
+    }
+
     /// Whether the tubes did change, unannounced: then somebody should look.
     fn has_changed(&self) -> bool {
         matches!(self.shop.scenario, Scenario::Shift { at, .. } if self.bent > at as u64)
     }
 
     /// Shows what should not be shown.
-    fn mixed_up(&mut self, which: MixUp, formed: &FormedTube, part: &Nominal) -> Said {
+    fn mixed_up(&mut self, which: MixUp, formed: &Lra, part: &Nominal) -> Said {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x313c_0001);
-        let mut other = super::parts::other(part, self.seed);
-        other.lra.bends.iter_mut().for_each(|b| b.angle_rad *= rng.random_range(0.99..1.01));
-        let lra = match &self.older {
-            Some((table, _)) if which == MixUp::WrongRevision => {
-                self.plant.clone().bend(table, part.lra.developed_length_mm()).lra
-            }
-            _ => which.tube(&formed.lra, &other.lra, &mut rng),
+        let older = self.older.clone().filter(|_| which == MixUp::WrongRevision);
+        let tube = match &older {
+            Some((table, _)) => self.plant.clone().bend(table, part.lra.developed_length_mm()).lra,
+            None => which.tube(formed, &super::parts::other(part, self.seed).lra, &mut rng),
         };
-        let measured = which.scan(self.scan(&FormedTube { lra, ..formed.clone() }, part, 0), &mut rng);
+        let measured = which.scan(self.scan(&tube, part, 0), &mut rng);
         let mut entry = which.entry(self.entry(measured, 0, false), self.shown.as_ref());
-        if let Some((_, revision)) = self.older.as_ref().filter(|_| which == MixUp::WrongRevision) {
-            entry.revision = *revision;
-        }
-        self.shown = Some(entry.clone());
-        self.controller.next(entry)
+        entry.revision = older.map_or(entry.revision, |(_, revision)| revision);
+        self.told(entry)
     }
 
     /// Bends a tube with the table in force.
-    fn bend(&mut self, part: &Nominal) -> FormedTube {
+    fn bend(&mut self, part: &Nominal) -> Lra {
         self.bent += 1;
-        self.plant.bend(&self.table, part.lra.developed_length_mm())
+        self.plant.bend(&self.table, part.lra.developed_length_mm()).lra
     }
 
     /// Scans the tube that was bent last.
-    fn scan(&self, formed: &FormedTube, part: &Nominal, again: usize) -> MeasuredTube {
+    fn scan(&self, formed: &Lra, part: &Nominal, again: usize) -> MeasuredTube {
         let stream = self.bent * (SCANS as u64 + 2) + again as u64;
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed ^ 0x5ca9_0000);
         rng.set_stream(stream);
-        let mut measured = self.shop.scanner.scan(&formed.lra, part.od_mm / 2.0, &mut rng);
+        let mut measured = self.shop.scanner.scan(formed, part.od_mm / 2.0, &mut rng);
         if let Scenario::Gross { share } = self.shop.scenario {
             for bend in &mut measured.bends {
                 let (wrong, more) = (rng.random_bool(share), rng.random_bool(0.5));
@@ -244,8 +237,12 @@ impl<'a> Job<'a> {
     }
 
     /// Shows a scan of the tube that was bent last; `rescan`: another one.
-    fn take(&mut self, measured: MeasuredTube, again: usize, rescan: bool) -> Said {
-        let entry = self.entry(measured, again, rescan);
+    fn show(&mut self, formed: &Lra, part: &Nominal, again: usize, rescan: bool) -> Said {
+        let measured = self.scan(formed, part, again);
+        self.told(self.entry(measured, again, rescan))
+    }
+
+    fn told(&mut self, entry: Scanned) -> Said {
         self.shown = Some(entry.clone());
         self.controller.next(entry)
     }

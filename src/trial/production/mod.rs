@@ -7,6 +7,7 @@
 //! scanner      a scan without a cloud          truth   what a tube really is
 //! parts        parts at random              mixups  what goes wrong around a bender
 //! campaign     many jobs of one part, for `benderd simulate production`
+//! stand        one job as a history, for benches and examples
 //! ```
 
 pub mod campaign;
@@ -17,4 +18,5 @@ pub mod mixups;
 mod oracle;
 pub mod parts;
 pub mod scanner;
+pub mod stand;
 pub mod truth;

@@ -5,6 +5,7 @@ use std::rc::Rc;
 
 use nalgebra::{DMatrix, DVector};
 
+use super::super::mixups::GROSS_RAD;
 use super::{log_normal, normal_middles, normalised};
 use crate::sim::forming::law::{Law, elastic_share};
 use crate::sim::forming::{World, spread};
@@ -22,9 +23,6 @@ const SHIFTS: usize = 15;
 
 /// Possibilities less likely than this are dropped.
 const LEAST: f64 = 1e-6;
-
-/// Gross errors of a scan's angle are so many degrees.
-const GROSS_RAD: f64 = 3.0 * std::f64::consts::PI / 180.0;
 
 /// Variance of an angle that says nothing.
 const NOTHING: f64 = 1.0;
