@@ -71,11 +71,12 @@ impl Solved {
         let spine = Spine::from_lra(&model.lra, Frame::identity());
         let places = line.places_mm(model);
         let columns = model.columns(parameters);
+        let seen: Vec<Matrix6<f64>> = spine.segments().iter().map(|s| to_segment(&s.start)).collect();
         let mut after = Downstream::empty(spine.segments().len());
         let mut loose = Vec::with_capacity(places.len());
         for i in (1..self.moments.len()).rev() {
             let (segment, moment) = &self.moments[i];
-            let part = Part::of(&symmetric(moment), &spine.segments()[*segment].start);
+            let part = Part::of(&symmetric(moment), &seen[*segment]);
             after.add(*segment, &part);
             let mut mixed = DMatrix::zeros(parameters.len(), 6);
             for column in &columns {
@@ -86,7 +87,7 @@ impl Solved {
             loose.push((0.5 * (places[i - 1] + places[i]), after.all.clone(), mixed));
         }
         if let Some((segment, moment)) = self.moments.first() {
-            after.add(*segment, &Part::of(&symmetric(moment), &spine.segments()[*segment].start));
+            after.add(*segment, &Part::of(&symmetric(moment), &seen[*segment]));
         }
         let whole = after.all.square;
         let test = |(at_mm, after, mixed): &(f64, Part, DMatrix<f64>)| {

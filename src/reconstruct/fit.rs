@@ -96,6 +96,7 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
         noise_mm: cutoff_mm / CUTOFF_SIGMAS,
         steps: effort.steps,
         goal: f64::INFINITY,
+        resolved: RESOLVED,
     };
     let mut state = descend(sample, start.clone(), &parameters, effort.prior, way(cutoff));
     passes += state.passes;
@@ -159,12 +160,14 @@ pub fn polish(
         used = pass.used() as f64;
         let sigma_mm = robust_sigma(&pass, cutoff_mm);
         let all = expectant_equations(&model, &pass.moments, &parameters, &effort.prior, sigma_mm);
-        let (mut normal, gradient) = held_at_bounds(&model, &parameters, all);
+        let (mut normal, gradient, step) = held_at_bounds(&model, &parameters, all);
+        let is_free = held.is_empty();
         for (parameter, spread) in held {
             let at = parameters.iter().position(|p| p == parameter);
             at.into_iter().for_each(|j| normal[(j, j)] += (sigma_mm / spread).powi(2));
         }
-        let step = damped_step(&normal, &gradient, NO_DAMPING)? * pass.shortfall();
+        let step = if is_free { step } else { damped_step(&normal, &gradient, NO_DAMPING) };
+        let step = step? * pass.shortfall();
         let variance = pass.variance_mm2(parameters.len());
         let size = -gradient.dot(&step) / variance.max(1e-300);
         let next_cutoff_mm = (CUTOFF_SIGMAS * sigma_mm).min(cutoff_mm);
@@ -224,7 +227,12 @@ pub struct Way {
     pub steps: usize,
     /// A descent that is far from getting below this cost is given up.
     pub goal: f64,
+    /// Share of a value's standard deviation that is not worth another step.
+    pub resolved: f64,
 }
+
+/// The usual one.
+pub const RESOLVED: f64 = 0.03;
 
 /// Steps after which a descent may be given up, and what it may still gain, in gains of its last step.
 const PATIENCE: usize = 8;
@@ -235,9 +243,6 @@ const HOPE: f64 = 10.0;
 /// which on no step will help.
 const NO_DAMPING: f64 = 1e-12;
 const MOST_DAMPING: f64 = 1e6;
-
-/// Share of a value's standard deviation that is not worth another step.
-const RESOLVED: f64 = 0.03;
 
 /// A step that gains less than this share of what an undamped one promises leads nowhere.
 const LEAST_SHARE: f64 = 5e-3;
@@ -254,6 +259,9 @@ struct Ground<'a, D: Data> {
     way: Way,
     passes: usize,
 }
+
+/// Normal matrix and gradient of what is free to step, and the undamped step.
+type Equations = (DMatrix<f64>, DVector<f64>, Option<DVector<f64>>);
 
 /// A place on the way.
 struct Stand {
@@ -273,21 +281,31 @@ impl<D: Data> Ground<'_, D> {
         Stand { model, pass, cost }
     }
 
-    fn equations(&self, at: &Stand) -> (DMatrix<f64>, DVector<f64>) {
+    fn equations(&self, at: &Stand) -> Equations {
         let (model, noise_mm) = (&at.model, self.way.noise_mm);
         let all = expectant_equations(model, &at.pass.moments, self.parameters, &self.prior, noise_mm);
         held_at_bounds(model, self.parameters, all)
     }
 
-    /// The first step of rising damping that leads down.
+    /// A gain that is not worth a step.
+    fn nothing(&self) -> f64 {
+        (self.way.resolved * self.way.noise_mm).powi(2)
+    }
+
+    /// The first step of rising damping that leads down; none once so damped a step promises nothing.
     fn downhill(
         &mut self,
         at: &Stand,
-        equations: &(DMatrix<f64>, DVector<f64>),
+        (normal, gradient, undamped): &Equations,
         damping: &mut f64,
     ) -> Option<Stand> {
         while *damping < MOST_DAMPING {
-            if let Some(step) = damped_step(&equations.0, &equations.1, *damping) {
+            let is_undamped = *damping <= NO_DAMPING;
+            let step = if is_undamped { undamped.clone() } else { damped_step(normal, gradient, *damping) };
+            if let Some(step) = step {
+                if -gradient.dot(&step) < self.nothing() {
+                    return None;
+                }
                 let next = self.stand(at.model.stepped(self.parameters, &step));
                 if next.cost < at.cost {
                     *damping = (*damping * 0.1).max(NO_DAMPING);
@@ -305,8 +323,7 @@ impl<D: Data> Ground<'_, D> {
         let mut at = None::<Stand>;
         for _ in 0..LEAP_STEPS {
             let here = at.as_ref().unwrap_or(from);
-            let (normal, gradient) = self.equations(here);
-            let step = damped_step(&normal, &gradient, NO_DAMPING)?;
+            let step = self.equations(here).2?;
             let next = self.stand(here.model.stepped(self.parameters, &step));
             if next.cost < from.cost {
                 return Some(next);
@@ -332,9 +349,8 @@ pub fn descend(
         let equations = ground.equations(&at);
         // What an undamped step would still gain: nothing that the data resolves. The gain of the last step says less,
         // since in a narrow valley damped steps are short.
-        let left = damped_step(&equations.0, &equations.1, NO_DAMPING)
-            .map_or(f64::INFINITY, |step| -equations.1.dot(&step));
-        if left < (RESOLVED * way.noise_mm).powi(2) {
+        let left = equations.2.as_ref().map_or(f64::INFINITY, |step| -equations.1.dot(step));
+        if left < ground.nothing() {
             stop = Stop::Converged;
             break;
         }
@@ -408,16 +424,16 @@ fn is_at_bound(model: &TubeModel, parameter: Parameter) -> bool {
 }
 
 /// The equations without those values that stand at a bound and would cross it in the step that the others take with them
-/// (each by itself may pull the other way).
+/// (each by itself may pull the other way). With that step.
 fn held_at_bounds(
     model: &TubeModel,
     parameters: &[Parameter],
     (mut normal, mut gradient): (DMatrix<f64>, DVector<f64>),
-) -> (DMatrix<f64>, DVector<f64>) {
+) -> Equations {
     let mut standing: Vec<usize> =
         (0..parameters.len()).filter(|&j| is_at_bound(model, parameters[j])).collect();
-    while !standing.is_empty() {
-        let Some(step) = damped_step(&normal, &gradient, NO_DAMPING) else { break };
+    loop {
+        let Some(step) = damped_step(&normal, &gradient, NO_DAMPING) else { return (normal, gradient, None) };
         let (crossing, inside): (Vec<usize>, Vec<usize>) = standing.into_iter().partition(|&j| step[j] < 0.0);
         for &j in &crossing {
             let diagonal = normal[(j, j)].max(1e-300);
@@ -427,11 +443,10 @@ fn held_at_bounds(
             gradient[j] = 0.0;
         }
         if crossing.is_empty() {
-            break;
+            return (normal, gradient, Some(step));
         }
         standing = inside;
     }
-    (normal, gradient)
 }
 
 /// Marquardt's step: damping in proportion to each parameter's own curvature.

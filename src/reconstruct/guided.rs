@@ -12,25 +12,23 @@
 mod doubt;
 mod own;
 
-use nalgebra::{DMatrix, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Point3, Translation3, UnitQuaternion, Vector3};
 
 use super::evidence::Solved;
-use super::fit::{CUTOFF_SIGMAS, Effort, RadiusPrior, Way, descend, fit, polish};
+use super::fit::{self, CUTOFF_SIGMAS, RESOLVED, RadiusPrior, Way, descend, polish};
 use super::likeness::{rows, unlikeness};
 use super::model::{Parameter, TubeModel};
 use super::moments::Sample;
 use super::moves::with_common_radius;
 use super::places::{Course, lay};
 use super::profile::{Held, lengths};
+use super::section::filling;
 use super::sections::CentreLine;
 use super::structure::{self, Shown, Structure};
 use crate::tube::{Decision, Lra, Nominal};
 
-/// Steps of the fits to the polygon, to the sections and to the points, and how often the sections are measured.
-const ROUGH_STEPS: usize = 20;
-const FULL_STEPS: usize = 40;
+/// Steps of a fit to the points.
 const POINT_STEPS: usize = 100;
-const MEASUREMENTS: usize = 2;
 
 /// A cloud of so many times the sample's points is large: a walk through it costs more than a fit to the sample.
 const MANY_SAMPLES: usize = 10;
@@ -40,6 +38,9 @@ const RADIUS_SPREAD: f64 = 0.3;
 
 /// A bend of less than this share of its nominal angle may have been lost by the fit: at no angle a plane says nothing.
 const LOST_SHARE: f64 = 0.2;
+
+/// Such a bend has strayed when it is this far from where the nominal has it, in tube radii: less is forming and the fit's.
+const STRAYED_RADII: f64 = 8.0;
 
 /// Answers that differ by fewer of these are the same.
 const SIGMAS: f64 = 4.0;
@@ -72,6 +73,22 @@ fn told(mut structure: Structure, why: &str, gain: f64, kept: bool) -> Structure
     structure
 }
 
+/// How far a fit goes.
+#[derive(Debug, Clone, Copy)]
+struct Effort {
+    steps: usize,
+    /// Share of a standard deviation that is not worth another step.
+    resolved: f64,
+    /// Given up where it cannot score below this.
+    goal: f64,
+}
+
+/// To the polygon; on the way; to the end; and not at all, only judged.
+const ROUGHLY: Effort = Effort { steps: 20, ..NEARLY };
+const NEARLY: Effort = Effort { resolved: 0.3, ..FULLY };
+const FULLY: Effort = Effort { steps: 40, resolved: RESOLVED, goal: f64::INFINITY };
+const AS_IT_IS: Effort = Effort { steps: 0, ..FULLY };
+
 /// A fit to the sections.
 #[derive(Debug, Clone)]
 struct Fitted {
@@ -99,21 +116,23 @@ struct Guided {
     solved: Solved,
 }
 
-/// Fits a model to the sections, or judges it as it is with no steps.
+/// Fits a model to the sections.
 fn fitted(
     line: &CentreLine,
     model: TubeModel,
     prior: Option<RadiusPrior>,
     correlation: f64,
-    steps: usize,
+    effort: Effort,
 ) -> Fitted {
     let model = model.settled();
     let parameters = model.parameters();
     let noise_mm = line.noise_mm;
-    let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: f64::INFINITY };
-    let descent = descend(&mut line.clone(), model, &parameters, prior, way);
-    let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / correlation;
-    let score = misfit + parameters.len() as f64 * (line.count / correlation).max(2.0).ln();
+    let price = parameters.len() as f64 * (line.count / correlation).max(2.0).ln();
+    let unit = noise_mm * noise_mm * correlation;
+    let Effort { steps, resolved, goal } = effort;
+    let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, resolved, goal: (goal - price) * unit / 2.0 };
+    let descent = descend(&mut &*line, model, &parameters, prior, way);
+    let score = 2.0 * descent.pass.cost / unit + price;
     Fitted { model: descent.model, parameters, score }
 }
 
@@ -135,9 +154,10 @@ fn hold(covariance: &mut DMatrix<f64>, parameters: &[Parameter], (parameter, sig
     }
 }
 
-/// The model with a bend that the fit has lost turned as the nominal has it; the bends after it stay in their planes.
+/// The model with a bend that the fit has lost turned as the nominal has it, and where it has it on the straight that the fit
+/// has made of it; the bends after it stay in their planes.
 fn bent_again(model: &TubeModel, part: &Lra, i: usize) -> TubeModel {
-    let mut out = model.clone();
+    let mut out = placed_again(model, part, i);
     let bends = &mut out.lra.bends;
     bends[i].angle_rad = part.bends[i].angle_rad;
     if i > 0 {
@@ -148,6 +168,37 @@ fn bent_again(model: &TubeModel, part: &Lra, i: usize) -> TubeModel {
         let turn = next.rotation_rad - part.bends[1].rotation_rad;
         next.rotation_rad -= turn;
         out.start *= UnitQuaternion::from_axis_angle(&Vector3::x_axis(), turn);
+    }
+    out
+}
+
+/// The model with a bend that turns nothing, and so may have strayed to anywhere on its straight, where the nominal has it
+/// between its neighbours; the tube stays where it is.
+fn placed_again(model: &TubeModel, part: &Lra, i: usize) -> TubeModel {
+    let mut out = model.clone();
+    let lengths = |lra: &Lra| {
+        let after = lra.bends.get(i + 1).map_or(lra.last_length_mm, |b| b.length_mm);
+        (lra.bends[i].length_mm, after)
+    };
+    let ((before, after), (wanted_before, wanted_after)) = (lengths(&model.lra), lengths(part));
+    // Where the tube ends there is no neighbour, and a straight of any length.
+    let later_mm = match (i, i + 1 == part.bends.len()) {
+        (0, true) => 0.0,
+        (0, false) => after - wanted_after,
+        (_, true) => wanted_before - before,
+        _ => (before + after) * wanted_before / (wanted_before + wanted_after).max(1e-9) - before,
+    };
+    if later_mm.abs() < STRAYED_RADII * model.tube_radius_mm {
+        return out;
+    }
+    if i == 0 {
+        out.start *= Translation3::new(later_mm, 0.0, 0.0);
+    } else {
+        out.lra.bends[i].length_mm += later_mm;
+    }
+    match out.lra.bends.get_mut(i + 1) {
+        Some(next) => next.length_mm -= later_mm,
+        None => out.lra.last_length_mm -= later_mm,
     }
     out
 }
@@ -163,32 +214,49 @@ impl Guided {
         let course = Course::new(polygon, radius_mm).filter(|_| !part.bends.is_empty())?;
         let prior = expected_radii(part);
         let rough = CentreLine::of_polygon(polygon, radius_mm);
-        let laid =
-            [(part.clone(), false), (part.reversed(), true)].into_iter().filter_map(|(part, reversed)| {
-                let start = TubeModel { flattening: shown.flattening.clone(), ..lay(&course, &part)? };
-                Some((fitted(&rough, start, prior, 1.0, ROUGH_STEPS), part, reversed))
-            });
+        let mut laid: Option<(Fitted, Lra, bool)> = None;
         // Where it fits as well both ways, the more alike.
         let off = |(found, part, _): &(Fitted, Lra, bool)| {
             found.score + unlikeness(&rows(&found.model.lra), &rows(part), radius_mm)
         };
-        let (mut best, part, reversed) = laid.min_by(|a, b| off(a).total_cmp(&off(b)))?;
+        for (part, reversed) in [(part.clone(), false), (part.reversed(), true)] {
+            let Some(start) = lay(&course, &part) else { continue };
+            let start = TubeModel { flattening: shown.flattening.clone(), ..start };
+            let goal = laid.as_ref().map_or(f64::INFINITY, off);
+            let found = (fitted(&rough, start, prior, 1.0, Effort { goal, ..ROUGHLY }), part, reversed);
+            laid = if off(&found) < goal { Some(found) } else { laid };
+        }
+        let (mut best, part, reversed) = laid?;
         let mut line = rough;
-        for round in 0..MEASUREMENTS {
-            line = CentreLine::measure(sample, &best.model, round > 0);
-            best = fitted(&line, best.model, prior, 1.0, FULL_STEPS);
+        // What the first measurement makes of the tube is where the last is taken: some of the points show it.
+        let some = filling(sample.len(), radius_mm, course.length_mm());
+        let some: Vec<Point3<f64>> = sample.iter().step_by(some).copied().collect();
+        for (points, effort, is_fitted) in [(&some[..], NEARLY, false), (sample, FULLY, true)] {
+            line = CentreLine::measure(points, &best.model, is_fitted);
+            best = fitted(&line, best.model, prior, 1.0, effort);
             for i in 0..part.bends.len() {
                 if best.model.lra.bends[i].angle_rad < LOST_SHARE * part.bends[i].angle_rad {
                     let again = bent_again(&best.model, &part, i);
-                    let again = fitted(&line, again, prior, 1.0, FULL_STEPS);
+                    let again = fitted(&line, again, prior, 1.0, effort);
                     best = if again.score < best.score { again } else { best };
                 }
             }
         }
-        let correlation = line.correlation(&best.model);
-        best = fitted(&line, best.model, prior, correlation, 0);
+        Some(Guided::of(line, best.model, prior, part, reversed))
+    }
+
+    /// The nominal's structure as it was fitted to the sections.
+    fn of(
+        line: CentreLine,
+        model: TubeModel,
+        prior: Option<RadiusPrior>,
+        part: Lra,
+        reversed: bool,
+    ) -> Guided {
+        let correlation = line.correlation(&model);
+        let mut best = fitted(&line, model, prior, correlation, AS_IT_IS);
         if has_common_radius(&part) && part.bends.len() > 1 {
-            let common = fitted(&line, with_common_radius(&best.model), prior, correlation, FULL_STEPS);
+            let common = fitted(&line, with_common_radius(&best.model), prior, correlation, FULLY);
             best = if common.score < best.score { common } else { best };
         }
         let solved = Solved::new(&line, &best.model, &best.parameters, None);
@@ -197,7 +265,7 @@ impl Guided {
         let mut covariance = &solved.inverse * variance;
         held.iter().for_each(|h| hold(&mut covariance, &best.parameters, h));
         let sigmas = covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect();
-        Some(Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved })
+        Guided { best, line, correlation, prior, part, reversed, sigmas, held, solved }
     }
 
     /// The structure; of a large cloud fitted to the sample's own points, from where the fit to all is a step or two.
@@ -206,10 +274,10 @@ impl Guided {
         if shown.whole.len() > MANY_SAMPLES * shown.sample.len() {
             let own = shown.sample.iter().filter(|p| !self.line.crowded().holds(p)).copied().collect();
             let cutoff_mm = CUTOFF_SIGMAS * noise_mm;
-            let effort = Effort { cutoff_mm, rounds: 0, steps: POINT_STEPS, prior: self.prior };
+            let effort = fit::Effort { cutoff_mm, rounds: 0, steps: POINT_STEPS, prior: self.prior };
             let mut sample = Sample::new(own, &model);
             let polished = polish(&mut sample, &model, effort, &self.held);
-            model = polished.unwrap_or_else(|| fit(&mut sample, &model, effort)).model;
+            model = polished.unwrap_or_else(|| fit::fit(&mut sample, &model, effort)).model;
         }
         let (held, prior) = (self.held.clone(), self.prior);
         let correlation = self.correlation;

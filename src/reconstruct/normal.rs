@@ -29,9 +29,8 @@ impl Part {
         Part { square: Matrix6::zeros(), mixed: SMatrix::zeros() }
     }
 
-    /// A full (symmetric) moment of a segment at `frame`.
-    pub fn of(moment: &Moment, frame: &Frame) -> Part {
-        let seen = to_segment(frame);
+    /// A full (symmetric) moment of a segment that has twists `seen` so ([`to_segment`]).
+    pub fn of(moment: &Moment, seen: &Matrix6<f64>) -> Part {
         Part {
             square: seen.transpose() * moment.fixed_view::<6, 6>(0, 0) * seen,
             mixed: seen.transpose() * moment.fixed_view::<6, NO_TWIST>(0, OWN),
@@ -63,7 +62,8 @@ pub fn equations(
 ) -> (DMatrix<f64>, DVector<f64>) {
     let spine = Spine::from_lra(&model.lra, Frame::identity());
     let full: Vec<Moment> = moments.iter().map(symmetric).collect();
-    let parts: Vec<Part> = full.iter().zip(spine.segments()).map(|(m, s)| Part::of(m, &s.start)).collect();
+    let parts: Vec<Part> =
+        full.iter().zip(spine.segments()).map(|(m, s)| Part::of(m, &to_segment(&s.start))).collect();
     let mut downstream = parts.clone();
     for k in (0..parts.len().saturating_sub(1)).rev() {
         let after = downstream[k + 1].clone();

@@ -5,6 +5,7 @@
 //! where that costs one unit of chi-squared is its standard deviation (profile likelihood).
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 use super::evidence::Solved;
 use super::fit::{RadiusPrior, Way, descend, invert};
@@ -16,12 +17,18 @@ use super::sections::CentreLine;
 const SUSPECT_RADII: f64 = 0.05;
 const SHORT_RADII: f64 = 0.3;
 
+/// The first step that is tried, in tube radii: about what it mostly comes to.
+const FIRST_RADII: f64 = 0.25;
+
 /// Halvings of the step, and steps of a fit.
 const HALVINGS: usize = 10;
 const STEPS: usize = 60;
 
 /// From a step that costs no more than this one goes to one that costs 1 as if costs grew by squares.
 const NEARLY_ONE: f64 = 5.0;
+
+/// A fit is near enough its best when it lacks so little, as a share of a standard deviation.
+const RESOLVED: f64 = 0.2;
 
 /// A value with its standard deviation as found by moving it.
 pub type Held = (Parameter, f64);
@@ -44,8 +51,19 @@ pub fn lengths(
         let short = model.lra.bends[i].length_mm < SHORT_RADII * model.tube_radius_mm;
         (unsure || short).then_some((i, linear_mm.min(most_mm)))
     };
-    let found = parameters.iter().enumerate().filter_map(suspect);
-    let cost = |i: usize, length_mm: f64| {
+    let found: Vec<(usize, f64)> = parameters.iter().enumerate().filter_map(suspect).collect();
+    if found.is_empty() {
+        return Vec::new();
+    }
+    let fitted = |start: TubeModel, free: &[Parameter], goal: f64| {
+        let (cutoff_mm, noise_mm) = (f64::INFINITY, line.noise_mm);
+        let way = Way { cutoff_mm, noise_mm, steps: STEPS, goal, resolved: RESOLVED };
+        descend(&mut &*line, start, free, prior, way)
+    };
+    let best = fitted(model.clone(), &parameters, f64::INFINITY);
+    let (model, least) = (best.model, best.pass.cost);
+    let dear = least + 0.5 * unit * NEARLY_ONE;
+    let excess = |i: usize, length_mm: f64| {
         let mut moved = model.clone();
         let change = length_mm - moved.lra.bends[i].length_mm;
         // Both arcs give way to the straight, so that the start is near the valley.
@@ -56,30 +74,39 @@ pub fn lengths(
         moved.lra.bends[i].length_mm = length_mm;
         let free: Vec<Parameter> =
             parameters.iter().copied().filter(|p| *p != Parameter::Length(i)).collect();
-        let way =
-            Way { cutoff_mm: f64::INFINITY, noise_mm: line.noise_mm, steps: STEPS, goal: f64::INFINITY };
-        2.0 * descend(&mut line.clone(), moved, &free, prior, way).pass.cost / unit
+        2.0 * (fitted(moved, &free, dear).pass.cost - least) / unit
     };
+    let first_mm = FIRST_RADII * model.tube_radius_mm;
     // To both sides: down to where the straight is none the tube may hardly change, and up it changes at once.
-    let spread = |(i, linear_mm): (usize, f64)| {
+    let spread = |&(i, linear_mm): &(usize, f64)| {
         let at = model.lra.bends[i].length_mm;
-        let least = cost(i, at);
-        let side = |way_mm: f64| one_unit(way_mm.abs(), |step| cost(i, at + step * way_mm.signum()) - least);
+        let side =
+            |way_mm: f64| one_unit(way_mm.abs(), first_mm, |step| excess(i, at + step * way_mm.signum()));
         let down_mm = if at > 0.0 { side(-linear_mm.min(at)) } else { 0.0 };
         (Parameter::Length(i), side(linear_mm).max(down_mm))
     };
-    found.map(spread).collect()
+    found.par_iter().map(spread).collect()
 }
 
-/// The step, no larger than `most`, that costs one unit of chi-squared by what halves of `most` cost.
-fn one_unit(most: f64, excess: impl Fn(f64) -> f64) -> f64 {
-    let mut step = most;
+/// The step, no larger than `most`, that costs one unit of chi-squared: `first`, doubled or halved until it costs about that.
+/// (Large steps lead far from the valley, and back takes long.)
+fn one_unit(most: f64, first: f64, excess: impl Fn(f64) -> f64) -> f64 {
+    let mut step = first.min(most);
+    let mut cost = excess(step);
+    while cost < 1.0 && step < most {
+        let wider = (2.0 * step).min(most);
+        let dearer = excess(wider);
+        if dearer > NEARLY_ONE {
+            return step;
+        }
+        (step, cost) = (wider, dearer);
+    }
     for _ in 0..HALVINGS {
-        let excess = excess(step);
-        if excess <= NEARLY_ONE {
-            return step / excess.max(1.0).sqrt();
+        if cost <= NEARLY_ONE {
+            return step / cost.max(1.0).sqrt();
         }
         step *= 0.5;
+        cost = excess(step);
     }
     step
 }

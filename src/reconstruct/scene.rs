@@ -212,8 +212,7 @@ fn tubes_of(work: &PointCloud, chains: &[Vec<Point3<f64>>], radius_mm: f64) -> V
 /// Points that lie on the tube's surface; None when too many around the centre line do not.
 fn on_surface(around: &Surroundings, radius_mm: f64, work: &PointCloud) -> Option<usize> {
     let distance = |i: usize| around.distance_mm(&work.point(i));
-    let distances: Vec<f64> =
-        (0..work.len()).into_par_iter().with_min_len(512).filter_map(distance).collect();
+    let distances: Vec<f64> = all_of(work).filter_map(distance).collect();
     let near = distances.iter().filter(|d| **d < 1.5 * radius_mm).count();
     let on = distances.iter().filter(|d| (**d - radius_mm).abs() < SURFACE_SHARE * radius_mm).count();
     (on as f64 >= LEAST_ON_SURFACE * near as f64).then_some(on)
@@ -241,7 +240,12 @@ fn exactly_on(tube: &Tube, cloud: &PointCloud, exact_mm: f64) -> usize {
         let distance = tube.around.distance_mm(&cloud.point(*i));
         distance.is_some_and(|d| (d - tube.radius_mm).abs() < exact_mm)
     };
-    (0..cloud.len()).into_par_iter().with_min_len(512).filter(on).count()
+    all_of(cloud).filter(on).count()
+}
+
+/// The indices of a cloud's points, for several threads to look at.
+fn all_of(cloud: &PointCloud) -> impl IndexedParallelIterator<Item = usize> {
+    (0..cloud.len()).into_par_iter().with_min_len(512)
 }
 
 /// The tube that is wanted, and a warning when there are others.
@@ -282,10 +286,10 @@ fn finish(cloud: &PointCloud, rest: &Moderate, tube: Tube, faces: Vec<Face>, war
     let (polygon, hidden) = reach::drawn_on(polygon, SPINE_SPACING_RADII * radius_mm, radius_mm, &rest.cloud);
     let same = polygon.len() == vertices;
     let around = if same { around } else { Surroundings::new(&polygon, radius_mm) };
-    let near: Vec<usize> = (0..rest.cloud.len()).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
+    let near: Vec<usize> = all_of(&rest.cloud).filter(|&i| around.is_near(&rest.cloud.point(i))).collect();
     // Thinning makes strays many: their share is that among any points.
     let some = any_share(cloud, SOME_POINTS);
-    let strays = some.iter().filter(|p| !around.is_near(p)).count();
+    let strays = all_of(&some).filter(|&i| !around.is_near(&some.point(i))).count();
     let alone = faces.is_empty() && strays as f64 <= STRAY_SHARE * some.len() as f64;
     let own = (!alone).then(|| around.own_points(cloud, &faces));
     let coarse = rest.spacing_mm > COARSEST_RADII * radius_mm;

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::evidence::{Joint, Solved};
-use super::fit::{RadiusPrior, Way, descend};
+use super::fit::{RESOLVED, RadiusPrior, Way, descend};
 use super::model::{Parameter, TubeModel};
 use super::moves::{doubled, drawn_apart, is_one, likeliest_pairs, merged, split, with_bend, without_bend};
 use super::sections::CentreLine;
@@ -88,6 +88,13 @@ pub(super) struct Jury {
     pub undecided: Undecided,
 }
 
+/// What the sections say of a candidate.
+struct Told {
+    solved: Solved,
+    /// The most helpful first.
+    joints: Vec<Joint>,
+}
+
 /// A change to be tried.
 struct Change {
     /// In words.
@@ -108,8 +115,8 @@ impl Jury {
             * noise_mm
             * noise_mm
             / 2.0;
-        let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth };
-        let descent = descend(&mut self.line.clone(), model, &parameters, self.prior, way);
+        let way = Way { cutoff_mm: f64::INFINITY, noise_mm, steps, goal: worth, resolved: RESOLVED };
+        let descent = descend(&mut &self.line, model, &parameters, self.prior, way);
         let misfit = 2.0 * descent.pass.cost / (noise_mm * noise_mm) / self.correlation;
         let score = misfit + self.price(parameters.len(), descent.model.lra.bends.len());
         Candidate { model: descent.model, parameters, score }
@@ -136,11 +143,12 @@ impl Jury {
     /// are remembered.
     pub(super) fn search(&mut self, mut best: Candidate) -> Candidate {
         for _ in 0..ROUNDS {
-            if let Some(other) = self.explained(&best) {
+            let told = self.told(&best);
+            if let Some(other) = self.explained(&best, &told) {
                 best = other;
                 continue;
             }
-            let mut tried = self.tried(&best);
+            let mut tried = self.tried(&best, &told);
             tried.sort_by(|a, b| a.1.score.total_cmp(&b.1.score));
             if let Some((i, better)) = self.better(&best, &tried) {
                 let (change, candidate) = tried.swap_remove(i);
@@ -175,7 +183,7 @@ impl Jury {
             if self.line.farthest_mm(&first.model) < most_mm {
                 break;
             }
-            let tried = self.tried(&first).into_iter().map(|(_, candidate)| candidate);
+            let tried = self.tried(&first, &self.told(&first)).into_iter().map(|(_, candidate)| candidate);
             let best = tried.min_by(|a, b| a.score.total_cmp(&b.score));
             let Some(better) = best.filter(|b| b.score < first.score - LEAST_GAIN) else { break };
             first = self.fit(&better.model, FULL_STEPS, f64::INFINITY);
@@ -191,7 +199,10 @@ impl Jury {
         let mut changes = Vec::new();
         for (change, candidate) in fewer.take(MOVED) {
             let less = self.fit(&candidate.model, FULL_STEPS, f64::INFINITY);
-            let more = self.changes(&less).into_iter().filter(|c| c.model.lra.bends.len() >= best.bends());
+            let more = self
+                .changes(&less, &self.told(&less))
+                .into_iter()
+                .filter(|c| c.model.lra.bends.len() >= best.bends());
             changes.extend(more.map(|m| (format!("{}, and {}", change.what, m.what), m.model)));
         }
         let fit = |(what, model)| (what, self.fit(&model, FULL_STEPS, best.score));
@@ -207,10 +218,9 @@ impl Jury {
 
     /// What looks like error that neighbours share may be a bend that is missing. Where one more takes much of it away, both
     /// are judged by what that one leaves.
-    fn explained(&mut self, best: &Candidate) -> Option<Candidate> {
-        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+    fn explained(&mut self, best: &Candidate, told: &Told) -> Option<Candidate> {
         let misfit = (best.score - self.price(best.parameters.len(), best.bends())) * self.correlation;
-        let joints = self.joints(best, &solved, EXPLAINED * misfit);
+        let joints = apart(&told.joints, EXPLAINED * misfit, best.model.tube_radius_mm);
         let tried = |j: &Joint| {
             let more = [with_bend(&best.model, j), split(&best.model, j)].concat();
             more.into_iter().map(|m| (j.at_mm, m)).collect::<Vec<_>>()
@@ -276,8 +286,9 @@ impl Jury {
         let least_mm = noise_mm.max(ABOVE_PASSES * passes_mm);
         loop {
             let dearest = best.score + DEAREST_NONE * self.price(5, 1);
-            let fewer = self.changes(&best).into_iter().filter(|c| c.model.lra.bends.len() < best.bends());
-            let fitted = fewer.map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
+            let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+            let fewer = self.fewer(&best, &solved);
+            let fitted = fewer.into_iter().map(|c| (self.fit(&c.model, FULL_STEPS, dearest), c.what));
             let none = fitted
                 .filter(|(c, _)| c.score < dearest && self.line.apart_mm(&best.model, &c.model) < least_mm);
             let Some((less, what)) = none.min_by(|a, b| a.0.score.total_cmp(&b.0.score)) else { return best };
@@ -290,8 +301,8 @@ impl Jury {
     }
 
     /// All changes by one bend that may be worth it, each fitted.
-    fn tried(&self, best: &Candidate) -> Vec<(Change, Candidate)> {
-        let changes = self.changes(best);
+    fn tried(&self, best: &Candidate, told: &Told) -> Vec<(Change, Candidate)> {
+        let changes = self.changes(best, told);
         let fit = |change: Change| {
             let candidate = self.fit(&change.model, TRIAL_STEPS, best.score);
             (change, candidate)
@@ -299,24 +310,39 @@ impl Jury {
         changes.into_par_iter().map(fit).collect()
     }
 
-    /// The changes that may be worth it.
-    fn changes(&self, best: &Candidate) -> Vec<Change> {
+    fn told(&self, best: &Candidate) -> Told {
+        let solved = Solved::new(&self.line, &best.model, &best.parameters, self.prior);
+        let mut joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
+        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
+        Told { solved, joints }
+    }
+
+    /// The changes to a bend less that may be worth it.
+    fn fewer(&self, best: &Candidate, solved: &Solved) -> Vec<Change> {
         let model = &best.model;
-        let n = model.lra.bends.len();
-        let solved = Solved::new(&self.line, model, &best.parameters, self.prior);
         let bearable = DOUBT * self.price(5, 1);
         let spine = model.spine();
         let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
-        let change = |what: String, bend: Option<usize>, model: TubeModel| Change { what, bend, model };
-        let shallow = |i: &usize| self.angle_worth(best, &solved, *i) < bearable;
-        let dropped = (0..n).filter(shallow).map(|i| {
-            change(format!("the bend at {:.0} mm pulled straight", at(i)), Some(i), without_bend(model, i))
+        let shallow = |i: &usize| self.angle_worth(best, solved, *i) < bearable;
+        let dropped = (0..best.bends()).filter(shallow).map(|i| {
+            let what = format!("the bend at {:.0} mm pulled straight", at(i));
+            Change { what, bend: Some(i), model: without_bend(model, i) }
         });
         let merged = likeliest_pairs(model).into_iter().filter_map(|i| {
             let what = format!("the bends at {:.0} and {:.0} mm made one", at(i - 1), at(i));
-            Some(change(what, Some(i - 1), merged(model, i)?))
+            Some(Change { what, bend: Some(i - 1), model: merged(model, i)? })
         });
-        let joints = self.joints(best, &solved, JOINT_GAIN * self.correlation);
+        dropped.chain(merged).collect()
+    }
+
+    /// All changes that may be worth it.
+    fn changes(&self, best: &Candidate, told: &Told) -> Vec<Change> {
+        let model = &best.model;
+        let n = model.lra.bends.len();
+        let spine = model.spine();
+        let at = |i: usize| spine.segments()[2 * i + 1].start_mm;
+        let change = |what: String, bend: Option<usize>, model: TubeModel| Change { what, bend, model };
+        let joints = apart(&told.joints, JOINT_GAIN * self.correlation, model.tube_radius_mm);
         let inserted = joints.iter().flat_map(|j| {
             let what = format!("a bend put in at {:.0} mm", j.at_mm);
             with_bend(model, j).into_iter().map(move |m| change(what.clone(), None, m))
@@ -329,26 +355,23 @@ impl Jury {
             let what = format!("the wide bend at {:.0} mm made two of the usual CLR", at(i));
             Some(change(what, Some(i), doubled(model, i)?))
         });
-        let apart = (1..n).filter_map(|i| {
+        let drawn = (1..n).filter_map(|i| {
             let what = format!("the bends at {:.0} and {:.0} mm drawn apart", at(i - 1), at(i));
             Some(change(what, Some(i), drawn_apart(model, i)?))
         });
-        let all = dropped.chain(merged).chain(inserted).chain(split).chain(doubled).chain(apart);
+        let fewer = self.fewer(best, &told.solved).into_iter();
+        let all = fewer.chain(inserted).chain(split).chain(doubled).chain(drawn);
         all.filter(|c| c.model.lra.bends.len() <= MOST_BENDS).collect()
     }
+}
 
-    /// Places where a joint would help by so much, the most helpful first, no two close together.
-    fn joints(&self, best: &Candidate, solved: &Solved, least_gain: f64) -> Vec<Joint> {
-        let radius = best.model.tube_radius_mm;
-        let mut joints = solved.joints(&self.line, &best.model, &best.parameters, self.line.noise_mm);
-        joints.retain(|j| j.gain > least_gain);
-        joints.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.at_mm.total_cmp(&b.at_mm)));
-        let mut out: Vec<Joint> = Vec::new();
-        for joint in joints {
-            if out.len() < JOINTS && out.iter().all(|o| (joint.at_mm - o.at_mm).abs() > 2.0 * radius) {
-                out.push(joint);
-            }
+/// Places where a joint would help by so much, the most helpful first, no two close together.
+fn apart(joints: &[Joint], least_gain: f64, tube_radius_mm: f64) -> Vec<Joint> {
+    let mut out: Vec<Joint> = Vec::new();
+    for joint in joints.iter().filter(|j| j.gain > least_gain) {
+        if out.len() < JOINTS && out.iter().all(|o| (joint.at_mm - o.at_mm).abs() > 2.0 * tube_radius_mm) {
+            out.push(*joint);
         }
-        out
     }
+    out
 }

@@ -113,6 +113,12 @@ pub struct Bins {
     pub length_mm: f64,
 }
 
+/// Of so many points along a tube, every how many-th still fills sections of the least length.
+pub fn filling(points: usize, radius_mm: f64, length_mm: f64) -> usize {
+    let per_radius = points as f64 * radius_mm / length_mm.max(1e-9);
+    ((per_radius * SECTION_RADII / ENOUGH_POINTS) as usize).max(1)
+}
+
 impl Bins {
     /// Sections that hold enough of `points` points.
     pub fn new(spine: &Spine, radius_mm: f64, points: usize) -> Bins {

@@ -6,7 +6,7 @@
 //! hundred times cheaper, and nothing is lost that a small change of the tube could show (the sums are sufficient
 //! statistics of the linearised residuals). The noise comes out of the sections' own scatter, whatever the structure.
 
-use nalgebra::{Matrix5, Point3, SMatrix, Vector3};
+use nalgebra::{Matrix2, Matrix5, Point3, SMatrix, Vector2, Vector3};
 use rayon::prelude::*;
 
 use super::fit::Data;
@@ -305,7 +305,7 @@ impl CentreLine {
     }
 }
 
-impl Data for CentreLine {
+impl Data for &CentreLine {
     fn pass(&mut self, model: &TubeModel, _cutoff_mm: f64) -> Pass {
         let mut pass = Pass::empty(2 * model.lra.bends.len() + 1);
         self.walk(model, |section, segment, values, derivatives| {
@@ -354,7 +354,7 @@ fn predict(
     (values, derivatives)
 }
 
-/// Adds the moment of a section at the values that a model predicts; returns their cost.
+/// Adds the moment of a section at the values that a model predicts (the lower triangle); returns their cost.
 fn add_moment(
     out: &mut Moment,
     sums: &Sums,
@@ -366,20 +366,24 @@ fn add_moment(
     // The residual falls as the values grow.
     let left = square * values - mixed;
     // Each row of the moment moves some of the values only: twists and CLR the place across, the others one value.
-    let (across, oval) =
-        (derivatives.fixed_view::<2, OVALITY>(1, 0), derivatives.fixed_view::<2, 1>(3, OVALITY));
-    let mut seen = SMatrix::<f64, VALUES, ROWS>::zeros();
-    seen.fixed_columns_mut::<OVALITY>(0).copy_from(&(square.fixed_columns::<2>(1) * across));
-    seen.set_column(OVALITY, &(square.fixed_columns::<2>(3) * oval));
-    seen.set_column(TUBE_RADIUS, &square.column(0));
-    let mut rows = out.fixed_view_mut::<OVALITY, ROWS>(0, 0);
-    rows += across.transpose() * seen.fixed_rows::<2>(1);
-    let mut row = out.fixed_view_mut::<1, ROWS>(OVALITY, 0);
-    row += oval.transpose() * seen.fixed_rows::<2>(3);
-    let mut row = out.fixed_view_mut::<1, ROWS>(TUBE_RADIUS, 0);
-    row += seen.row(0);
-    let mut row = out.fixed_view_mut::<1, ROWS>(RESIDUAL, 0);
-    row += left.transpose() * derivatives;
+    let oval = Vector2::new(derivatives[(3, OVALITY)], derivatives[(4, OVALITY)]);
+    let both: Matrix2<f64> = square.fixed_view::<2, 2>(1, 1).into_owned();
+    let oval_seen: Vector2<f64> = square.fixed_view::<2, 2>(1, 3) * oval;
+    for j in 0..OVALITY {
+        let across = Vector2::new(derivatives[(1, j)], derivatives[(2, j)]);
+        let seen = both * across;
+        for i in j..OVALITY {
+            out[(i, j)] += derivatives[(1, i)] * seen[0] + derivatives[(2, i)] * seen[1];
+        }
+        out[(OVALITY, j)] += oval_seen.dot(&across);
+        out[(TUBE_RADIUS, j)] += square[(0, 1)] * across[0] + square[(0, 2)] * across[1];
+        out[(RESIDUAL, j)] += left[1] * across[0] + left[2] * across[1];
+    }
+    out[(OVALITY, OVALITY)] += (square.fixed_view::<2, 2>(3, 3) * oval).dot(&oval);
+    out[(TUBE_RADIUS, OVALITY)] += square[(0, 3)] * oval[0] + square[(0, 4)] * oval[1];
+    out[(RESIDUAL, OVALITY)] += left[3] * oval[0] + left[4] * oval[1];
+    out[(TUBE_RADIUS, TUBE_RADIUS)] += square[(0, 0)];
+    out[(RESIDUAL, TUBE_RADIUS)] += left[0];
     let cost = cost(sums, values);
     out[(RESIDUAL, RESIDUAL)] += cost;
     cost

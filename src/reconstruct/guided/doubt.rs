@@ -9,7 +9,7 @@ use super::super::moves::{split, with_bend};
 use super::super::search::{ABOVE_PASSES, JOINT_GAIN};
 use super::super::stripes;
 use super::super::whole::Whole;
-use super::{FULL_STEPS, Guided, SIGMAS, fitted};
+use super::{AS_IT_IS, FULLY, Guided, SIGMAS, fitted};
 
 /// A vertex of the spine's polygon this far from the fitted centre line is not explained by it, in tube radii; and how
 /// many in a row may be so.
@@ -115,9 +115,9 @@ impl Guided {
         // Its place is the best of many.
         let place = 2.0 * (line.places() as f64).ln();
         let is_better = |more: TubeModel| {
-            let more = fitted(line, more, self.prior, self.correlation, FULL_STEPS).model;
+            let more = fitted(line, more, self.prior, self.correlation, FULLY).model;
             let correlation = line.correlation(&more).min(self.correlation);
-            let judged = |m: &TubeModel| fitted(line, m.clone(), self.prior, correlation, 0).score;
+            let judged = |m: &TubeModel| fitted(line, m.clone(), self.prior, correlation, AS_IT_IS).score;
             judged(&more) + place < judged(model) && line.apart_mm(model, &more) > ABOVE_PASSES * passes_mm()
         };
         more.into_iter().any(is_better)

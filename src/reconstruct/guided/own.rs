@@ -7,7 +7,7 @@ use super::super::places::SHALLOW_RAD;
 use super::super::search::DOUBT;
 use super::super::sections::CentreLine;
 use super::super::structure::{Shown, Structure};
-use super::{Chosen, FULL_STEPS, Guided, SIGMAS, fitted, told};
+use super::{AS_IT_IS, Chosen, Effort, FULLY, Guided, SIGMAS, fitted, told};
 
 /// Two answers that differ by less than this and the sigmas are the same.
 const SAME_ANGLE_RAD: f64 = 0.05 * std::f64::consts::PI / 180.0;
@@ -30,7 +30,8 @@ impl Guided {
             let sigma = self.angle_sigma_rad(i);
             if bend.angle_rad < SHALLOW_RAD && (bend.angle_rad / sigma).powi(2) < worth_a_look {
                 let less = without_bend(&self.best.model, i);
-                let less = fitted(&self.line, less, self.prior, self.correlation, FULL_STEPS);
+                let effort = Effort { goal: self.best.score, ..FULLY };
+                let less = fitted(&self.line, less, self.prior, self.correlation, effort);
                 if less.score >= self.best.score {
                     continue;
                 }
@@ -52,8 +53,8 @@ impl Guided {
         let n = self.part.bends.len();
         let line = CentreLine::measure(shown.sample, &own.model, true);
         let correlation = line.correlation(&own.model);
-        let mine = fitted(&line, self.best.model.clone(), self.prior, correlation, FULL_STEPS);
-        let other = fitted(&line, own.model.clone(), own.prior, correlation, 0);
+        let mine = fitted(&line, self.best.model.clone(), self.prior, correlation, FULLY);
+        let other = fitted(&line, own.model.clone(), own.prior, correlation, AS_IT_IS);
         let bends = other.model.lra.bends.len();
         let sure = self.is_determined();
         let formed = self.is_formed_of_the_nominal();
@@ -61,7 +62,12 @@ impl Guided {
         let saved = bend_price(&line, correlation) * n.saturating_sub(bends) as f64;
         let spared = formed && mine.score - saved <= other.score;
         let gain = other.score - mine.score;
-        let mine_is_kept = || (told(self.structure(shown), KEPT, gain, true), self.resting());
+        // As fitted beside the scan's own: its own fit may have lost its way.
+        let mine_is_kept = || {
+            let found =
+                Guided::of(line.clone(), mine.model.clone(), self.prior, self.part.clone(), self.reversed);
+            (told(found.structure(shown), KEPT, gain, true), found.resting())
+        };
         if sure && (mine.score <= other.score || spared) {
             return mine_is_kept();
         }
