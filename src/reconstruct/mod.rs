@@ -68,6 +68,7 @@ use crate::tube::{Decision, Lra, MeasuredTube, Nominal, Spine};
 use model::{Flattening, TubeModel};
 use scene::Scene;
 use structure::{Shown, Structure};
+use whole::ScanPass;
 
 /// What may be known beforehand.
 #[derive(Debug, Clone, Copy, Default)]
@@ -172,6 +173,39 @@ fn in_pool<R: Send>(work: impl FnOnce() -> R + Send) -> R {
     rayon::scope(|_| work())
 }
 
+/// A scan with its passes moved onto each other.
+struct Moved {
+    passes: Vec<ScanPass>,
+    sample: Vec<Point3<f64>>,
+    flattening: Flattening,
+    /// Its structure, and notes on it.
+    found: (Structure, Vec<String>),
+}
+
+/// The passes moved as a tube about as this one asks for, which scattered by `noise_mm` before. None where there is one pass only,
+/// and where the tube scatters no less after: then they were moved by what was missing of its shape.
+fn moved(
+    shown: &Shown,
+    about: &Structure,
+    noise_mm: f64,
+    guide: Option<&Nominal>,
+) -> Option<Moved> {
+    let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, about));
+    if passes.is_empty() {
+        return None;
+    }
+    let whole = shown.whole.moved(&passes);
+    let sample = in_pool(|| realign::sample(&whole, &about.model));
+    // What was found must not be lost: the polygon, which begins anew, is of the passes as they were.
+    let (flattening, before) = (Flattening::NONE, Some(about.model.clone()));
+    let mut again = Shown { whole, sample: &sample, flattening, before, ..*shown };
+    let mut found = in_pool(|| choose(&mut again, guide))?;
+    let what = format!("{} passes of the scan moved onto each other", passes.len());
+    found.0.decisions.push(Decision { what, bend: None, gain, kept: true });
+    let flattening = again.flattening;
+    (found.0.noise_mm < noise_mm).then_some(Moved { passes, sample, flattening, found })
+}
+
 /// Reconstructs with the structure by `guide`, or freely.
 fn by(
     cloud: &PointCloud,
@@ -191,17 +225,14 @@ fn by(
     begins(Stage::Structure);
     let mut shown = Shown::new(cloud, &scene, &sample);
     let (mut chosen, mut notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
-    let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, &chosen));
-    let again =
-        (!passes.is_empty()).then(|| in_pool(|| realign::sample(&shown.whole.moved(&passes), &chosen.model)));
-    if let Some(again) = &again {
-        // What was found must not be lost: the polygon, which begins anew, is of the passes as they were.
-        let (flattening, before) = (Flattening::NONE, Some(chosen.model));
-        shown = Shown { whole: shown.whole.moved(&passes), sample: again, flattening, before, ..shown };
-        (chosen, notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
-        let what = format!("{} passes of the scan moved onto each other", passes.len());
-        chosen.decisions.push(Decision { what, bend: None, gain, kept: true });
+    let closest = || structure::closest(&shown, &chosen);
+    let moved = moved(&shown, &chosen, chosen.noise_mm, guide)
+        .or_else(|| moved(&shown, &in_pool(closest)?, chosen.noise_mm, guide));
+    if let Some(Moved { passes, sample, flattening, .. }) = &moved {
+        let flattening = flattening.clone();
+        shown = Shown { whole: shown.whole.moved(passes), sample, flattening, ..shown };
     }
+    (chosen, notes) = moved.as_ref().map_or((chosen, notes), |m| m.found.clone());
     if moves::is_free_form(&chosen.model.lra, radius_mm) {
         return Err(not_bent());
     }

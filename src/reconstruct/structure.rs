@@ -136,6 +136,17 @@ pub fn choose(shown: &Shown) -> Option<Structure> {
     Some(jury.confirmed(shown.sample, best.model, again.map(|(_, other)| other.model)))
 }
 
+/// The tube in as many bends as its polygon shows at the finest tolerance, needed or not: where passes lie apart a search may have
+/// spared bends, and what it left of the shape would be taken for the passes'.
+pub fn closest(shown: &Shown, chosen: &Structure) -> Option<Structure> {
+    let finest = TOLERANCES.into_iter().fold(f64::INFINITY, f64::min);
+    let model = start(shown.polygon, finest * shown.radius_mm, shown.radius_mm)?;
+    let line = CentreLine::measure(shown.sample, &model, true);
+    let jury = Jury { line, correlation: 1.0, prior: None, decisions: Vec::new(), undecided: Undecided::new() };
+    let model = jury.fit(&model, FULL_STEPS, f64::INFINITY).model;
+    Some(Structure { model, ..chosen.clone() })
+}
+
 /// The best tube that a search finds from the polygon, or from a tube that was found before.
 fn searched(shown: &Shown, before: Option<&TubeModel>) -> Option<(Jury, Candidate)> {
     let Shown { polygon, sample, radius_mm, whole, .. } = *shown;
