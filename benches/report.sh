@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 
 sizes=(6005 100000 1000000 5000000)
 stages=(read scene structure finish reconstruct "file to table")
-seeds=(${SEEDS:-101000 102000 103000})
+seeds=(${SEEDS:-107000 108000 109000})
 release=${CARGO_TARGET_DIR:-target}/release
 
 sections=(times operations accuracy nominal)

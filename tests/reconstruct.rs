@@ -254,6 +254,20 @@ fn oblique_ends_that_once_were_silently_wrong() {
     expect_right(Set::Hard, &[91246, 92078, 92196]);
 }
 
+/// A face that was seen all around lay off an outline of which less than half was seen (102018); the tip of a mitre between two
+/// stripes passed for a burr on a square end (103115).
+#[test]
+fn an_outline_that_half_of_the_end_is_missing_from() {
+    expect_right(Set::Hard, &[102018, 103115]);
+}
+
+/// Two bends that passed for one while the passes lay apart: what that left of the shape was taken for the passes', and they were
+/// moved by millimetres.
+#[test]
+fn passes_are_not_moved_by_what_is_missing_of_the_shape() {
+    expect_right(Set::Hard, &[104166]);
+}
+
 /// A section of face and bore at an end drew the first fit off its way: an arc swallowed the end straight, whose points then passed
 /// for strangers'.
 #[test]
