@@ -105,6 +105,7 @@ part release cargo build --locked --release --bins --example deliveries
 part demo demo
 part "peers: install" bash tests/peers/install.sh
 part peers bash tests/peers/run.sh target/release/benderd
+part "an outside shop" python3 -B tests/peers/shop.py target/release/benderd config/parts/bracket-17.toml
 part "late commit" bash tests/peers/late_commit.sh target/release/benderd
 part "can peers: install" bash tests/peers/can/install.sh
 part "can peers" bash tests/peers/can/run.sh target/release/benderd

@@ -230,6 +230,6 @@ fn numbered<'a>(
 }
 
 fn is_json(path: &Path) -> anyhow::Result<bool> {
-    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let text = std::fs::read_to_string(path).with_context(|| format!("{}: cannot be read", path.display()))?;
     Ok(text.trim_start().starts_with('{'))
 }

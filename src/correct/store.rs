@@ -13,7 +13,7 @@ use super::{Knowledge, check};
 #[derive(Debug, Error)]
 pub enum StoreError {
     /// The system refused.
-    #[error("{file}: {source}")]
+    #[error("knowledge file {file}: cannot be read or written")]
     Io {
         /// Path as given.
         file: String,

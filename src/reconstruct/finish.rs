@@ -24,6 +24,9 @@ use super::whole::{Whole, end_frames};
 use super::{Reconstruction, TubeModel};
 use crate::tube::{Frame, MeasuredTube};
 
+/// Half of a scan's points usually lie no farther off than this, or than this share of the tube's radius.
+const USUAL_ROUGHNESS_MM: f64 = 0.1;
+const USUAL_ROUGHNESS_RADII: f64 = 0.02;
 /// An angle is never left open: a tube with one less certain than this was not measured.
 const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 
@@ -138,12 +141,26 @@ fn finish_as_chosen(
     measured.decisions.extend(flattening::decision(&best, correlation.near));
     measured.points_total = whole.file_len();
     measured.warnings.splice(0..0, warnings.iter().cloned());
+    measured.warnings.extend(roughness(best.median_mm, best.model.tube_radius_mm));
     let (spine, TubeModel { lra, ovality_mm, flattening, .. }) = (best.model.spine(), best.model);
     let flattening_mm = match flattening {
         Flattening::Free { bends_mm, .. } => bends_mm,
         Flattening::Known(_) => Vec::new(),
     };
     Ok(Reconstruction { measured, spine, lra, ovality_mm, flattening_mm })
+}
+
+/// A warning where the points leave a round tube's surface by more than tubes and scanners do.
+fn roughness(median_mm: f64, radius_mm: f64) -> Option<String> {
+    let usual_mm = USUAL_ROUGHNESS_MM.max(USUAL_ROUGHNESS_RADII * radius_mm);
+    (median_mm > usual_mm).then(|| {
+        format!(
+            "half of the points lie more than {median_mm:.2} mm off the surface, {:.1} % of the tube's radius (usual is up to \
+             {usual_mm:.2} mm): not round, not smooth or not one tube; take its values for rough ones and look at \
+             --export report.html",
+            100.0 * median_mm / radius_mm
+        )
+    })
 }
 
 /// A bend at an end of a tube with others, whose angle is not known from none.
@@ -230,4 +247,17 @@ fn reaches(sample: &mut Sample, model: &TubeModel, reach_mm: f64) -> (f64, f64) 
     };
     let length_mm = spine.segments()[last].length_mm;
     (reach(0, &|x| x), reach(last, &|x| length_mm - x))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_no_scanner_leaves_of_a_round_tube_is_said() {
+        assert_eq!(roughness(0.1, 3.0), None);
+        assert_eq!(roughness(0.4, 20.0), None);
+        let said = roughness(1.302, 22.606).unwrap();
+        assert!(said.contains("1.30 mm") && said.contains("5.8 %") && said.contains("0.45 mm"), "{said}");
+    }
 }
