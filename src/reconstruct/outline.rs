@@ -86,9 +86,11 @@ pub fn find(points: &[Point3<f64>], radius_mm: f64, noise_mm: f64, passes_mm: f6
     let mut fine = rough.refined(edge.as_ref(), &passes);
     if let Some(clean) = edge.as_ref().and_then(Edge::without_burr) {
         let other = rough.refined(Some(&clean), &passes);
-        // Past an oblique edge's own slope no part of it stands out.
+        // Past an oblique edge's own slope no part of it stands out: then it may be either.
         let is_burr = || edge.as_ref().is_some_and(|e| e.along(&fine.free).without_burr().is_some());
-        fine = if other.is_square() && is_burr() { other } else { fine };
+        if other.is_square() {
+            fine = if is_burr() { other } else { Fine { both: fine.both.or(&other.both), ..fine } };
+        }
     }
     let Fine { free, both } = fine;
     let Estimate { value, variance } = both.estimate;

@@ -70,17 +70,30 @@ pub fn weigh(free: &Estimate, square: &Estimate, lure: &Lure) -> Weighed {
     let log_odds = lure.log_likelihood(free) - log_likelihood(free, MITRE_SPREAD)
         + (SQUARE_SHARE / (1.0 - SQUARE_SHARE)).ln();
     let share = 1.0 / (1.0 + (-log_odds).exp());
-    let apart = square.value - mitred.value;
+    let (estimate, sigma_mm) = mixed(square, share, &mitred);
+    Weighed { estimate, sigma_mm, square_share: share }
+}
+
+impl Weighed {
+    /// Where nothing tells which of two is true.
+    pub fn or(&self, other: &Weighed) -> Weighed {
+        let (estimate, sigma_mm) = mixed(&self.estimate, 0.5, &other.estimate);
+        Weighed { estimate, sigma_mm, square_share: 0.5 * (self.square_share + other.square_share) }
+    }
+}
+
+/// The mean of two planes, one with this share, their covariance about it, and its sigma.
+fn mixed(one: &Estimate, share: f64, other: &Estimate) -> (Estimate, f64) {
+    let apart = one.value - other.value;
     let estimate = Estimate {
-        value: mitred.value + apart * share,
-        variance: square.variance * share
-            + mitred.variance * (1.0 - share)
+        value: other.value + apart * share,
+        variance: one.variance * share
+            + other.variance * (1.0 - share)
             + apart * apart.transpose() * (share * (1.0 - share)),
     };
-    let parts = [(share, square), (1.0 - share, &mitred)];
+    let parts = [(share, one), (1.0 - share, other)];
     let at_sigmas = |(sigmas, within)| reach_mm(&parts, estimate.value.x, within) / sigmas;
-    let sigma_mm = WITHIN.map(at_sigmas).into_iter().fold(0.0, f64::max);
-    Weighed { estimate, sigma_mm, square_share: share }
+    (estimate, WITHIN.map(at_sigmas).into_iter().fold(0.0, f64::max))
 }
 
 /// How far around `about_mm` such a share of several normal distributions lies, each with its own share.
