@@ -270,7 +270,9 @@ mod tests {
             ));
         }
         let end = found(&points);
-        assert!((end.at_mm - clean.at_mm).abs() < clean.sigma_mm, "{end:?} {clean:?}");
+        // It might be the tip of a mitre: the sigma knows.
+        let moved_mm = (end.at_mm - clean.at_mm).abs();
+        assert!(moved_mm < end.sigma_mm && moved_mm < 0.15, "{end:?} {clean:?}");
         points.extend(ring(3.3, 0.0));
         for p in points.iter_mut().filter(|p| p.x < 3.4 && p.y > 9.0 && p.y.hypot(p.z) < 9.95) {
             p.x -= 0.25;
