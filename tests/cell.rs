@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use benderd::arm::ScanFile;
 use benderd::bender::TableId;
-use benderd::cell::{Action, Cell, Decision, Delivered, Dwell, Event, InForce, Purpose, State, Ticket};
+use benderd::cell::{Action, Cell, Decision, Delivered, Dwell, Event, Hold, InForce, Purpose, State, Ticket};
 use benderd::config::Mode;
 use benderd::correct::{Answer, Code, Reason, Verdict};
 use benderd::tube::{CommandTable, MeasuredTube};
@@ -345,7 +345,7 @@ fn an_unknown_delivery_is_resolved_by_reading_and_never_sent_again() {
 fn a_table_changed_at_the_machine_holds() {
     let mut b = Bench::at(Mode::Automatic, "Reading(Recall)").unwrap();
     b.read(3);
-    let State::Held(reason) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    let State::Held(Hold { reason, .. }) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
     assert!(reason.contains("expected revision 2") && reason.contains("found revision 3"), "{reason}");
 }
 
@@ -413,7 +413,7 @@ fn three_unusable_scans_in_a_row_hold_and_two_do_not() {
         assert!(matches!(&actions[..], [Action::FileFailed(_, why)] if why == "a cube"));
         assert_eq!(b.cell.wants_scan(), round < 3, "round {round}");
     }
-    let State::Held(reason) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    let State::Held(Hold { reason, .. }) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
     assert!(reason.contains("3 scans in a row") && reason.contains("a cube"), "{reason}");
 }
 

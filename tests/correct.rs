@@ -23,14 +23,7 @@ fn bracket() -> Nominal {
 }
 
 fn part(commanded: &CommandTable, measured: MeasuredTube, id: &str) -> Part {
-    Part {
-        commanded: commanded.clone(),
-        measured,
-        revision: None,
-        scan_id: Some(id.into()),
-        cut_length_mm: None,
-        rescan: false,
-    }
+    Part { scan_id: Some(id.into()), ..Part::new(commanded.clone(), measured) }
 }
 
 fn history(parts: Vec<Part>) -> History {

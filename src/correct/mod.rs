@@ -8,6 +8,7 @@
 //! What jobs leave behind is [`knowledge`], on disk by [`store`]; [`import`] puts in what others know, [`learned`] and
 //! [`summary`] say what is believed of a key.
 
+mod approval;
 mod belief;
 mod check;
 pub mod estimate;
@@ -31,8 +32,9 @@ pub mod store;
 pub mod summary;
 pub mod values;
 pub mod verdict;
+mod worse;
 
-pub use history::{History, Part, SetUp};
+pub use history::{Changed, History, Part, SetUp};
 pub use knowledge::Knowledge;
 pub use plan::Limits;
 pub use predicted::{Predicted, PredictedPoint};
@@ -96,12 +98,12 @@ fn decide(job: &Job, replay: &Replay) -> Answer {
     match (&replay.newest, replay.used.last()) {
         (Newest::Refused(reason), _) => held(job, replay, vec![reason.clone()]),
         (Newest::Used { outliers, .. }, Some(newest)) => {
-            if let Some(reason) = mixups::old_table(job.nominal, replay) {
+            if let Some(reason) = mixups::edited(job).or_else(|| mixups::old_table(job.nominal, replay)) {
                 return held(job, replay, vec![reason]);
             }
             let doubts = doubts(job.nominal, newest, outliers);
             if doubts.is_empty() {
-                batch_changed(job, replay, judged(job, replay, newest))
+                settled(job, replay, judged(job, replay, newest))
             } else {
                 answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts)
             }
@@ -239,6 +241,27 @@ fn cut_length(whole: &MeasuredTube, job: &Job) -> Option<Reason> {
         off.abs()
     );
     Some(Reason::new(Code::CutLength, text))
+}
+
+/// What is judged, unless a person has to look first: at tubes that changed, at corrections that do harm, at the first good
+/// tube after a change.
+fn settled(job: &Job, replay: &Replay, judged: Answer) -> Answer {
+    let judged = batch_changed(job, replay, judged);
+    let hold = |reason, judged: Answer, commanded| {
+        let reasons = std::iter::once(reason).chain(judged.reasons).collect();
+        Answer { verdict: Verdict::Hold, commanded, reasons, ..judged }
+    };
+    match judged.verdict {
+        Verdict::InTolerance => match approval::awaited(job.history) {
+            Some(reason) => hold(reason, judged.clone(), judged.commanded),
+            None => judged,
+        },
+        Verdict::Correct => match worse::worse_twice(job.nominal, replay) {
+            Some((table, reason)) => answer(Verdict::Hold, table, replay, vec![reason]),
+            None => judged,
+        },
+        _ => judged,
+    }
 }
 
 /// Tubes that suddenly spring back otherwise, all bends alike, are another batch, or the set-up was changed: somebody has to look, and

@@ -31,10 +31,16 @@ pub enum Code {
     SameScan,
     /// The commanded table is not this part's.
     Program,
+    /// The machine held another table than was answered: somebody edited it there.
+    TableEdited,
     /// The tube was bent with another revision of the table than it is said to be.
     Revision,
     /// All bends spring back by another factor than before.
     BatchChanged,
+    /// Corrected tables made it worse twice: back to the last good one.
+    WorseTwice,
+    /// The first good tube after a change, which nobody has approved yet.
+    Unapproved,
     /// The scan shows another number of bends.
     BendCount,
     /// The mirror image fits better.
@@ -112,7 +118,8 @@ impl Reason {
 pub struct Answer {
     /// What to do next.
     pub verdict: Verdict,
-    /// The table to bend with, or in rescan and hold the one in force.
+    /// The table to bend with; in rescan and hold the one in force, but where a hold proposes one for approval (another batch, worse
+    /// twice).
     pub commanded: CommandTable,
     /// Predicted commanded minus formed angle per bend at this table.
     pub springback_deg: Vec<f64>,
