@@ -246,22 +246,17 @@ fn cut_length(whole: &MeasuredTube, job: &Job) -> Option<Reason> {
 /// What is judged, unless a person has to look first: at tubes that changed, at corrections that do harm, at the first good
 /// tube after a change.
 fn settled(job: &Job, replay: &Replay, judged: Answer) -> Answer {
-    let judged = batch_changed(job, replay, judged);
-    let hold = |reason, judged: Answer, commanded| {
-        let reasons = std::iter::once(reason).chain(judged.reasons).collect();
-        Answer { verdict: Verdict::Hold, commanded, reasons, ..judged }
-    };
-    match judged.verdict {
-        Verdict::InTolerance => match approval::awaited(job.history) {
-            Some(reason) => hold(reason, judged.clone(), judged.commanded),
-            None => judged,
-        },
-        Verdict::Correct => match worse::worse_twice(job.nominal, replay) {
-            Some((table, reason)) => answer(Verdict::Hold, table, replay, vec![reason]),
-            None => judged,
-        },
-        _ => judged,
+    // First: a machine that turns every correction round looks like one change of batch after the other.
+    if judged.verdict == Verdict::Correct
+        && let Some((table, reason)) = worse::worse_twice(job.nominal, replay)
+    {
+        return answer(Verdict::Hold, table, replay, vec![reason]);
     }
+    let judged = batch_changed(job, replay, judged);
+    let awaited = approval::awaited(job.history).filter(|_| judged.verdict == Verdict::InTolerance);
+    let Some(reason) = awaited else { return judged };
+    let reasons = std::iter::once(reason).chain(judged.reasons).collect();
+    Answer { verdict: Verdict::Hold, reasons, ..judged }
 }
 
 /// Tubes that suddenly spring back otherwise, all bends alike, are another batch, or the set-up was changed: somebody has to look, and
