@@ -359,6 +359,55 @@ fn an_outlier_is_scanned_again_and_believed_when_it_stays() {
     assert_eq!(ask(&history(parts)).verdict, Verdict::InTolerance);
 }
 
+/// Three good tubes of one table and a fourth that is scanned otherwise.
+fn fourth(change: impl Fn(&mut MeasuredTube)) -> History {
+    let table = first_table();
+    let mut parts: Vec<Part> =
+        ["a", "b", "c", "d"].map(|id| part(&table, measured(&bracket().lra, 0.03), id)).into();
+    change(&mut parts[3].measured);
+    history(parts)
+}
+
+#[test]
+fn a_scan_worse_than_this_parts_usual_is_made_again_and_believed_the_second_time() {
+    let score = |mm: f64, used: usize| {
+        let h = fourth(|m| (m.residual_median_mm, m.points_used) = (mm, used));
+        (ask(&h).verdict, codes(&ask(&h)))
+    };
+    assert_eq!(
+        score(0.06, 190_000).0,
+        Verdict::InTolerance,
+        "usual are 0.03 mm and 190 000 points of 200 000"
+    );
+    assert_eq!(score(0.0601, 190_000), (Verdict::Rescan, vec![Code::ScanScore]));
+    assert_eq!(score(0.03, 142_501).0, Verdict::InTolerance);
+    assert_eq!(score(0.03, 142_499), (Verdict::Rescan, vec![Code::ScanScore]));
+    let mut twice = fourth(|m| m.residual_median_mm = 0.1);
+    twice.parts.push(Part { scan_id: Some("again".into()), ..rescan(twice.parts[3].clone()) });
+    assert_eq!(ask(&twice).verdict, Verdict::InTolerance);
+    // Two tubes are not yet what is usual.
+    let mut few = fourth(|m| m.residual_median_mm = 0.1);
+    few.parts.remove(0);
+    assert_eq!(ask(&few).verdict, Verdict::InTolerance);
+}
+
+#[test]
+fn a_straight_that_scatters_and_axes_that_miss_each_other_are_scanned_again() {
+    let most = bracket().tolerance.envelope_mm / 4.0;
+    let straight = |rms: f64| {
+        ask(&fourth(|m| m.straight_rms_mm = vec![Some(0.05), Some(rms), None, Some(0.05), Some(0.05)]))
+    };
+    assert_eq!(straight(most - 0.001).verdict, Verdict::InTolerance, "two sigma are half the envelope");
+    let answer = straight(most + 0.001);
+    assert_eq!((answer.verdict, codes(&answer)), (Verdict::Rescan, vec![Code::StraightFit]));
+    assert!(answer.reasons[0].text.contains("straight 2"), "{answer:?}");
+    let gap = |mm: f64| ask(&fourth(|m| m.nearest_pass_mm = vec![None, Some(0.3), Some(mm), Some(0.1)]));
+    assert_eq!(gap(2.0).verdict, Verdict::InTolerance);
+    let answer = gap(2.01);
+    assert_eq!((answer.verdict, codes(&answer)), (Verdict::Rescan, vec![Code::NearestPass]));
+    assert_eq!(answer.reasons[0].bend, Some(3));
+}
+
 /// A machine that bends by the spring-back it is told as it should, but moves every correction the wrong way: three tubes.
 fn wrong_way() -> Vec<Part> {
     let first = first_table();

@@ -12,6 +12,7 @@ mod approval;
 mod belief;
 mod check;
 pub mod estimate;
+mod gates;
 pub mod history;
 pub mod import;
 pub mod knowledge;
@@ -101,7 +102,8 @@ fn decide(job: &Job, replay: &Replay) -> Answer {
             if let Some(reason) = mixups::edited(job).or_else(|| mixups::old_table(job.nominal, replay)) {
                 return held(job, replay, vec![reason]);
             }
-            let doubts = doubts(job.nominal, newest, outliers);
+            let mut doubts = gates::doubts(job.nominal, newest, outliers);
+            doubts.extend(gates::scan_score(replay));
             if doubts.is_empty() {
                 settled(job, replay, judged(job, replay, newest))
             } else {
@@ -177,33 +179,6 @@ fn undecided(
     );
     reasons.push(Reason::new(Code::Unproven, text));
     answer(Verdict::Correct, in_force, replay, reasons)
-}
-
-/// Measurements that nothing should be concluded from: too uncertain, or unlike this bend's others.
-fn doubts(nominal: &Nominal, newest: &Used, outliers: &[estimate::Outlier]) -> Vec<Reason> {
-    let deg = f64::to_degrees;
-    let tolerance = nominal.tolerance.angle_rad;
-    let bends = newest.measured.bends.iter().enumerate();
-    let uncertain = bends.filter(|(_, b)| 2.0 * b.angle_sigma_rad > tolerance).map(|(i, b)| {
-        let text = format!(
-            "angle {} is known to +-{:.2} degrees (one sigma) only, tolerance is {:.2}: scan both its straights again",
-            i + 1,
-            deg(b.angle_sigma_rad),
-            deg(tolerance)
-        );
-        Reason::at(Code::TooUncertain, i, text)
-    });
-    let odd = outliers.iter().map(|o| {
-        let text = format!(
-            "bend {}: spring-back {:.2} degrees where {:.2} +-{:.2} is expected: scan again; if it stays, look at clamp and mandrel",
-            o.bend + 1,
-            deg(o.found_rad),
-            deg(o.expected_rad.value),
-            deg(o.expected_rad.sigma)
-        );
-        Reason::at(Code::Outlier, o.bend, text)
-    });
-    uncertain.chain(odd).collect()
 }
 
 /// The same tube with its last straight as long as wanted: that end is the cut length's matter.

@@ -51,6 +51,12 @@ pub enum Code {
     Direction,
     /// The scan's sigma leaves no room in the tolerance.
     TooUncertain,
+    /// The points of a straight scatter too much about it.
+    StraightFit,
+    /// The axes beside a bend miss each other.
+    NearestPass,
+    /// The scan is worse than this part's usual.
+    ScanScore,
     /// A bend that does not fit what it did before.
     Outlier,
     /// Check points were not measured, or not well enough: another scan can tell.
