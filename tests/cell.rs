@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use benderd::arm::ScanFile;
 use benderd::bender::TableId;
-use benderd::cell::{Action, Cell, Decision, Delivered, Dwell, Event, InForce, Purpose, State, Ticket};
+use benderd::cell::{Action, Cell, Decision, Delivered, Dwell, Event, Hold, InForce, Purpose, State, Ticket};
 use benderd::config::Mode;
-use benderd::correct::{Answer, Code, Reason, Verdict};
+use benderd::correct::{Answer, Changed, Code, Reason, Verdict};
 use benderd::tube::{CommandTable, MeasuredTube};
 
 /// A cell with a clock turned by hand. It remembers the ticket of the last work it was asked for.
@@ -345,7 +345,8 @@ fn an_unknown_delivery_is_resolved_by_reading_and_never_sent_again() {
 fn a_table_changed_at_the_machine_holds() {
     let mut b = Bench::at(Mode::Automatic, "Reading(Recall)").unwrap();
     b.read(3);
-    let State::Held(reason) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    let State::Held(Hold { reason, code }) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    assert_eq!(*code, Some(Code::TableEdited));
     assert!(reason.contains("expected revision 2") && reason.contains("found revision 3"), "{reason}");
 }
 
@@ -387,6 +388,67 @@ fn a_changed_batch_begins_with_the_tube_that_showed_it() {
     assert_eq!((name(b.cell.state()).as_str(), b.cell.history().len()), ("Deciding(first piece)", 1));
 }
 
+/// A cell whose first tube is held for this.
+fn held_for(code: Code) -> Bench {
+    let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
+    let mut held = decision(Verdict::Hold);
+    held.answer.reasons = vec![Reason::new(code, "look")];
+    b.on(Event::Decided(b.ticket, held));
+    let State::Held(hold) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    assert_eq!(hold.code, Some(code));
+    b
+}
+
+#[test]
+fn armed_again_after_worse_twice_the_last_good_table_is_delivered_and_its_first_tube_marked() {
+    let mut b = held_for(Code::WorseTwice);
+    b.on(Event::Arm);
+    let actions = b.read(2);
+    let [Action::Deliver(_, rolled_back, over, _)] = &actions[..] else { panic!("{actions:?}") };
+    assert_eq!((rolled_back, *over), (&table(7.0), id(2)));
+    b.on(Event::Delivered(b.ticket, Delivered::Applied(id(3))));
+    b.on(Event::Scan(scan()));
+    b.read(3);
+    b.on(Event::Measured(b.ticket, tube()));
+    let changed: Vec<_> = b.cell.history().iter().map(|part| part.changed).collect();
+    assert_eq!(changed, [None, Some(Changed::RollBack)]);
+}
+
+#[test]
+fn a_roll_back_is_not_delivered_over_a_table_that_somebody_changed_meanwhile() {
+    let mut b = held_for(Code::WorseTwice);
+    b.on(Event::Arm);
+    assert!(matches!(b.read(9)[..], [Action::Decide(_)]));
+    assert!(b.cell.history().is_empty());
+}
+
+#[test]
+fn arming_after_the_first_good_tube_of_a_change_approves_it() {
+    let mut b = held_for(Code::Unapproved);
+    assert!(!b.cell.history()[0].approved);
+    b.on(Event::Arm);
+    assert!(matches!(b.read(2)[..], [Action::Decide(_)]));
+    assert!(b.cell.history()[0].approved);
+    b.decide(Verdict::InTolerance);
+    assert!(b.cell.wants_scan());
+}
+
+#[test]
+fn the_first_tube_of_a_changed_batch_or_after_a_change_at_the_machine_is_marked() {
+    let b = held_for(Code::BatchChanged);
+    assert_eq!(b.cell.history()[0].changed, Some(Changed::Batch));
+    let mut b = Bench::at(Mode::Automatic, "Reading(Recall)").unwrap();
+    b.read(3);
+    b.on(Event::Arm);
+    b.read(3);
+    b.decide(Verdict::FirstPiece);
+    b.on(Event::Delivered(b.ticket, Delivered::Applied(id(4))));
+    b.on(Event::Scan(scan()));
+    b.read(4);
+    b.on(Event::Measured(b.ticket, tube()));
+    assert_eq!(b.cell.history()[0].changed, Some(Changed::Table));
+}
+
 #[test]
 fn a_tube_that_is_scanned_again_stays_one_tube() {
     let mut b = Bench::at(Mode::Automatic, "Deciding(scan)").unwrap();
@@ -413,7 +475,7 @@ fn three_unusable_scans_in_a_row_hold_and_two_do_not() {
         assert!(matches!(&actions[..], [Action::FileFailed(_, why)] if why == "a cube"));
         assert_eq!(b.cell.wants_scan(), round < 3, "round {round}");
     }
-    let State::Held(reason) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
+    let State::Held(Hold { reason, .. }) = b.cell.state() else { panic!("{:?}", b.cell.state()) };
     assert!(reason.contains("3 scans in a row") && reason.contains("a cube"), "{reason}");
 }
 

@@ -336,7 +336,8 @@ async fn a_scan_that_cannot_be_filed_away_is_not_taken_twice() {
     let (_commands, receiver) = mpsc::channel(1);
     tokio::spawn(driver.run(receiver));
     loop {
-        if let Notice::State(State::Held(reason)) = notices.recv().await.unwrap() {
+        if let Notice::State(State::Held(hold)) = notices.recv().await.unwrap() {
+            let reason = hold.reason;
             assert!(
                 reason.contains("cannot be filed away") && reason.contains("/nowhere/scan.ply"),
                 "{reason}"

@@ -142,14 +142,7 @@ fn the_chain_from_cloud_to_table_converges() {
                 ScanSettings { density: Density::Points(30_000), views: 2, ..ScanSettings::default() };
             let cloud = scan::scan(&shape, &settings, 100 * seed + part).cloud();
             let found = reconstruct(&cloud, &Options { nominal: Some(&nominal) }).unwrap();
-            history.parts.push(Part {
-                commanded: table,
-                measured: found.measured,
-                revision: None,
-                scan_id: Some(part.to_string()),
-                cut_length_mm: None,
-                rescan: false,
-            });
+            history.parts.push(Part { scan_id: Some(part.to_string()), ..Part::new(table, found.measured) });
             let answer = step(&nominal, &history, &Knowledge::default(), &limits);
             let (angle, point) = (truth.angle_rad.to_degrees(), truth.envelope_mm);
             lines.push(format!("{:?} {angle:.2} deg {point:.2} mm", answer.verdict));

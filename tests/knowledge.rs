@@ -85,14 +85,8 @@ fn job(known: &Knowledge, bender: &str, batch: &str, tubes: usize, springback_de
         for (bend, row) in formed.bends.iter_mut().zip(&commanded.bends) {
             bend.angle_rad = row.angle_rad - springback_deg.to_radians();
         }
-        history.parts.push(Part {
-            commanded: commanded.clone(),
-            measured: measured(&formed, 0.03),
-            revision: None,
-            scan_id: Some(format!("{bender} {batch} {tube}")),
-            cut_length_mm: None,
-            rescan: false,
-        });
+        let scan_id = Some(format!("{bender} {batch} {tube}"));
+        history.parts.push(Part { scan_id, ..Part::new(commanded.clone(), measured(&formed, 0.03)) });
     }
     learn(&nominal, &history, known, &Limits::default())
 }

@@ -76,14 +76,7 @@ fn history(parts: Vec<Part>) -> History {
 }
 
 fn part(commanded: &CommandTable, tube: &Lra, id: usize) -> Part {
-    Part {
-        commanded: commanded.clone(),
-        measured: measured(tube, 0.03),
-        revision: None,
-        scan_id: Some(id.to_string()),
-        cut_length_mm: None,
-        rescan: false,
-    }
+    Part { scan_id: Some(id.to_string()), ..Part::new(commanded.clone(), measured(tube, 0.03)) }
 }
 
 fn ask(nominal: &Nominal, history: &History, limits: &Limits) -> Answer {

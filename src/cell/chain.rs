@@ -74,12 +74,11 @@ impl Craft for Chain {
 
     fn decide(&self, parts: &[Part]) -> Decision {
         let part = |p: &Part| correct::Part {
-            commanded: p.in_force.table.clone(),
-            measured: p.measured.clone(),
             revision: Some(u64::from(p.in_force.id.revision)),
-            scan_id: None,
-            cut_length_mm: None,
             rescan: p.rescan,
+            changed: p.changed,
+            approved: p.approved,
+            ..correct::Part::new(p.in_force.table.clone(), p.measured.clone())
         };
         let history = History { key: self.key.clone(), batch: None, parts: parts.iter().map(part).collect() };
         let inspection = parts.last().and_then(|p| inspect(&p.measured, &self.nominal).ok());

@@ -14,7 +14,7 @@ use tokio::time::Instant;
 
 use super::event::{Action, Decision, Dwell, Event, InForce, Ticket};
 use super::journalling::record;
-use super::machine::{Cell, Part, State};
+use super::machine::{Cell, Hold, Part, State};
 use super::worker::{Ask, Worker};
 use crate::arm::{ArmError, Filing, ScanFile, ScanSource};
 use crate::bender::{Bender, Job};
@@ -235,7 +235,11 @@ impl<S: ScanSource, C: Craft> Driver<S, C> {
             State::Held(_) | State::Faulted(_) => tracing::warn!(cell, "{words}"),
             _ => tracing::info!(cell, "{words}"),
         }
-        record(&mut self.journal, "state", &json!({ "machine": cell, "state": words }));
+        let mut content = json!({ "machine": cell, "state": words });
+        if let State::Held(Hold { code: Some(code), .. }) = state {
+            content["code"] = json!(code);
+        }
+        record(&mut self.journal, "state", &content);
         // Without a listener there is nobody to tell.
         let _ = self.notices.send(Notice::State(state.clone()));
     }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::arm::ScanFile;
 use crate::bender::{Operation, TableId};
-use crate::correct::Answer;
+use crate::correct::{Answer, Code};
 use crate::inspect::Inspection;
 use crate::tube::{CommandTable, MeasuredTube};
 
@@ -34,6 +34,11 @@ pub struct Decision {
 }
 
 impl Decision {
+    /// The first reason's code: why it is held.
+    pub fn code(&self) -> Option<Code> {
+        self.answer.reasons.first().map(|reason| reason.code)
+    }
+
     /// The reasons in one line, for the operator.
     pub fn reasons(&self) -> String {
         self.answer.reasons.iter().map(|r| r.text.as_str()).collect::<Vec<_>>().join("; ")

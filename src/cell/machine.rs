@@ -1,8 +1,8 @@
 //! The loop of one bending cell as a pure state machine: events and time in, actions out.
 //!
 //! Every transition is a named method; [`Cell::on`] only says which event leads to which. What is safe about
-//! it: a table is delivered from `Deciding` only, that is reached only from a machine just read, and a cell
-//! comes up, and comes back from every fault, disarmed. All transitions at a glance are in the snapshot beside
+//! it: a table is delivered from `Deciding`, or with a person's approval when the cell is armed, in both cases after the
+//! machine was just read, and a cell comes up, and comes back from every fault, disarmed. All transitions at a glance are in the snapshot beside
 //! `tests/cell.rs`.
 
 use std::fmt;
@@ -12,7 +12,7 @@ use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 use crate::arm::ScanFile;
 use crate::bender::{Operation, TableId};
 use crate::config::Mode;
-use crate::correct::{Code, Verdict};
+use crate::correct::{Answer, Changed, Code, Verdict};
 use crate::tube::{CommandTable, MeasuredTube};
 
 /// Scans in a row that could not be used before a person must look.
@@ -39,9 +39,27 @@ pub enum State {
     /// A table is on its way.
     Delivering(CommandTable),
     /// A person must look; arming again goes on.
-    Held(String),
+    Held(Hold),
     /// The machine cannot be reached; it is read again by itself, and comes back disarmed.
     Faulted(Box<Fault>),
+}
+
+/// Why a person must look.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hold {
+    /// For machines, as in `benderd correct`'s reasons; none where the cell itself cannot go on.
+    pub code: Option<Code>,
+    /// For people.
+    pub reason: String,
+}
+
+/// What is approved by arming after a hold.
+#[derive(Debug, Clone, PartialEq)]
+enum Approval {
+    /// The tube measured last is good.
+    Tube,
+    /// This earlier table is gone back to.
+    RollBack(CommandTable),
 }
 
 /// Why the machine is being read.
@@ -77,7 +95,7 @@ impl fmt::Display for State {
             State::Measuring(_) => f.write_str("measuring"),
             State::Deciding(_) => f.write_str("deciding"),
             State::Delivering(_) => f.write_str("delivering a table"),
-            State::Held(reason) => write!(f, "held: {reason}"),
+            State::Held(hold) => write!(f, "held: {}", hold.reason),
             State::Faulted(fault) => write!(f, "faulted: {}", fault.reason),
         }
     }
@@ -92,6 +110,10 @@ pub struct Part {
     pub measured: MeasuredTube,
     /// Whether this is another scan of the tube before.
     pub rescan: bool,
+    /// What was changed before it.
+    pub changed: Option<Changed>,
+    /// Whether somebody has approved it.
+    pub approved: bool,
 }
 
 /// One bending cell.
@@ -115,6 +137,10 @@ pub struct Cell {
     history: Vec<Part>,
     /// The last tube is to be scanned again.
     rescan: bool,
+    /// What arming approves.
+    approval: Option<Approval>,
+    /// What was changed since the last tube.
+    changed: Option<Changed>,
     /// Scans in a row that could not be used.
     unusable: u32,
     /// Attempts to reach the machine in a row that failed.
@@ -137,6 +163,8 @@ impl Cell {
             ours: None,
             history: Vec::new(),
             rescan: false,
+            approval: None,
+            changed: None,
             unusable: 0,
             attempts: 0,
         }
@@ -199,7 +227,7 @@ impl Cell {
             (_, Event::Disarm) => self.disarm(),
             (state, Event::Tick) if self.wake_at().is_some_and(|at| at <= now) => self.overdue(state),
             (State::Ready | State::InTolerance, Event::Scan(scan)) => self.read(Purpose::Recall(scan)),
-            (State::Ready | State::InTolerance, Event::FilingFailed(reason)) => self.hold(reason),
+            (State::Ready | State::InTolerance, Event::FilingFailed(reason)) => self.hold(None, reason),
             (State::Reading(why), Event::MachineRead(t, read)) if t == self.ticket => {
                 self.machine_read(why, read)
             }
@@ -271,16 +299,16 @@ impl Cell {
                 read.program, self.program
             )
         });
-        self.in_force = Some(read);
+        let before = self.in_force.replace(read);
         match (why, other_program) {
             (Purpose::Contact, _) => self.contacted(),
             (Purpose::Resolve(intent), _) => self.resolved(intent, found),
-            (Purpose::Arming, Some(reason)) => self.hold(reason),
+            (Purpose::Arming, Some(reason)) => self.hold(Some(Code::Program), reason),
             (Purpose::Recall(scan), Some(reason)) => self.scan_of_other_program(scan, reason),
-            (Purpose::Arming, None) if ours => self.decide(None),
+            (Purpose::Arming, None) if ours => self.approved(),
             (Purpose::Arming, None) => self.begin_job(),
             (Purpose::Recall(scan), None) if ours || self.mode == Mode::Observe => self.measure(scan),
-            (Purpose::Recall(scan), None) => self.changed_at_machine(scan, found),
+            (Purpose::Recall(scan), None) => self.changed_at_machine(scan, found, before),
         }
     }
 
@@ -307,8 +335,26 @@ impl Cell {
         vec![Action::SetAside("the tube was bent before the table now in force, or nobody can say by which")]
     }
 
+    /// The job goes on as it was, or with what arming has approved.
+    fn approved(&mut self) -> Vec<Action> {
+        match self.approval.take() {
+            Some(Approval::RollBack(table)) => {
+                self.changed = Some(Changed::RollBack);
+                return self.deliver(table);
+            }
+            Some(Approval::Tube) => {
+                self.history.iter_mut().rev().take(1).for_each(|part| part.approved = true)
+            }
+            None => {}
+        }
+        self.decide(None)
+    }
+
+    /// Over a table that is not this cell's. Where there was one of its own, somebody has changed it.
     fn begin_job(&mut self) -> Vec<Action> {
         self.history.clear();
+        self.approval = None;
+        self.changed = self.ours.map(|_| Changed::Table);
         self.rescan = false;
         self.unusable = 0;
         self.decide(None)
@@ -324,13 +370,23 @@ impl Cell {
         vec![Action::Measure(self.next_ticket(), scan)]
     }
 
-    fn changed_at_machine(&mut self, scan: ScanFile, found: TableId) -> Vec<Action> {
+    fn changed_at_machine(&mut self, scan: ScanFile, found: TableId, before: Option<InForce>) -> Vec<Action> {
         let expected = self.ours.map_or_else(|| "none".to_owned(), |r| r.to_string());
+        let held = self.in_force.as_ref().zip(before).map(|(now, before)| {
+            // Read back, a table is in the machine's steps; the ids say already that it is another one.
+            before
+                .table
+                .differences(&now.table, (0.0, 0.0))
+                .iter()
+                .map(|d| format!("; {d}"))
+                .collect::<String>()
+        });
         let reason = format!(
-            "the machine's table is not the one that was delivered (expected {expected}, found {found}): somebody \
-             changed it there; arming again begins the job afresh"
+            "the machine's table is not the one that was delivered (expected {expected}, found {found}{}): somebody \
+             changed it there; arming again begins the job afresh",
+            held.unwrap_or_default()
         );
-        self.enter(State::Held(reason.clone()));
+        drop(self.hold(Some(Code::TableEdited), reason.clone()));
         vec![Action::FileFailed(scan, reason)]
     }
 
@@ -338,7 +394,7 @@ impl Cell {
     fn scan_of_other_program(&mut self, scan: ScanFile, reason: String) -> Vec<Action> {
         match self.mode {
             Mode::Observe => self.enter(State::Ready),
-            Mode::Automatic => drop(self.hold(reason.clone())),
+            Mode::Automatic => drop(self.hold(Some(Code::Program), reason.clone())),
         }
         vec![Action::FileFailed(scan, reason)]
     }
@@ -357,18 +413,19 @@ impl Cell {
         Vec::new()
     }
 
-    fn hold(&mut self, reason: String) -> Vec<Action> {
+    fn hold(&mut self, code: Option<Code>, reason: String) -> Vec<Action> {
         self.next_ticket();
         self.disarm_after = false;
         self.rescan = false;
-        self.enter(State::Held(reason));
+        self.enter(State::Held(Hold { code, reason }));
         Vec::new()
     }
 
     fn measured(&mut self, scan: ScanFile, measured: MeasuredTube) -> Vec<Action> {
         let rescan = std::mem::take(&mut self.rescan);
         if let Some(in_force) = self.in_force.clone() {
-            self.history.push(Part { in_force, measured, rescan });
+            let changed = self.changed.take();
+            self.history.push(Part { in_force, measured, rescan, changed, approved: false });
         }
         if self.history.len() > MAX_HISTORY {
             self.history.remove(0);
@@ -383,7 +440,7 @@ impl Cell {
         } else {
             let count = self.unusable;
             self.unusable = 0;
-            self.hold(format!("{count} scans in a row could not be used; the last one: {reason}"));
+            self.hold(None, format!("{count} scans in a row could not be used; the last one: {reason}"));
         }
         vec![Action::FileFailed(scan, reason)]
     }
@@ -396,15 +453,15 @@ impl Cell {
                 self.unusable(scan, decision.reasons())
             }
             (Verdict::Hold, Some(scan)) => {
-                if decision.answer.is_about(Code::BatchChanged) {
-                    // Whoever arms again has approved it: this tube is the new batch's first.
-                    self.history.drain(..self.history.len().saturating_sub(1));
-                } else {
+                if !self.keep_for_approval(&decision.answer) {
                     self.history.pop();
                 }
-                self.held_by_decision(scan, decision.reasons())
+                self.held_by_decision(scan, &decision)
             }
-            (Verdict::Hold | Verdict::Rescan, None) => self.hold(decision.reasons()),
+            (Verdict::Hold | Verdict::Rescan, None) => {
+                self.keep_for_approval(&decision.answer);
+                self.hold(decision.code(), decision.reasons())
+            }
             (verdict, scan) => {
                 self.unusable = 0;
                 match scan {
@@ -420,11 +477,29 @@ impl Cell {
         }
     }
 
+    /// Whether the hold is one that arming approves: then its tube stays in the history.
+    fn keep_for_approval(&mut self, answer: &Answer) -> bool {
+        let newest = self.history.len().saturating_sub(1);
+        if answer.is_about(Code::BatchChanged) {
+            // This tube is the new batch's first. Observing, nobody is there to approve the next good one.
+            self.history.drain(..newest);
+            let changed = (self.mode == Mode::Automatic).then_some(Changed::Batch);
+            self.history.iter_mut().for_each(|part| part.changed = changed);
+        } else if answer.is_about(Code::WorseTwice) {
+            self.approval = Some(Approval::RollBack(answer.commanded.clone()));
+        } else if answer.is_about(Code::Unapproved) {
+            self.approval = Some(Approval::Tube);
+        } else {
+            return false;
+        }
+        true
+    }
+
     /// The part has no say in what follows: whoever arms again has looked at it. Observing has nothing to stop.
-    fn held_by_decision(&mut self, scan: ScanFile, reasons: String) -> Vec<Action> {
+    fn held_by_decision(&mut self, scan: ScanFile, decision: &Decision) -> Vec<Action> {
         match self.mode {
             Mode::Observe => self.enter(State::Ready),
-            Mode::Automatic => drop(self.hold(reasons)),
+            Mode::Automatic => drop(self.hold(decision.code(), decision.reasons())),
         }
         vec![Action::FileDone(scan)]
     }
@@ -462,7 +537,7 @@ impl Cell {
                 }
                 actions
             }
-            Delivered::Rejected(reason) => self.hold(reason),
+            Delivered::Rejected(reason) => self.hold(None, reason),
             Delivered::NotApplied(reason) => self.fault(reason, Purpose::Contact),
             Delivered::Unknown(reason, intent) => self.fault(reason, Purpose::Resolve(intent)),
         }
@@ -479,7 +554,7 @@ impl Cell {
                 self.unusable(scan, late("measuring"))
             }
             State::Deciding(scan) => {
-                self.hold(late("deciding"));
+                self.hold(None, late("deciding"));
                 scan.map(|scan| Action::FileFailed(scan, late("deciding"))).into_iter().collect()
             }
             State::Delivering(_) => self.fault(late("delivering"), Purpose::Resolve(None)),

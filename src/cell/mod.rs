@@ -22,5 +22,5 @@ pub use chain::{Chain, MeasuredScan, measure, measure_scan};
 pub use driver::{Command, Craft, Decided, Driver, Identity, Notice};
 pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 pub use intents::JournalledIntents;
-pub use machine::{Cell, Fault, Part, Purpose, State};
+pub use machine::{Cell, Fault, Hold, Part, Purpose, State};
 pub use setup::{Setup, SetupError};

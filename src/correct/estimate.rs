@@ -28,7 +28,7 @@ const RESIDUAL_SIGMA_RAD: f64 = 0.10 * DEGREE;
 /// Scatter from bend to bend that no table can take out.
 pub(super) const BEND_SCATTER_RAD: f64 = 0.08 * DEGREE;
 /// Scatter from tube to tube, common to its bends, as a share of the spring-back.
-const TUBE_SCATTER: f64 = 0.015;
+pub(super) const TUBE_SCATTER: f64 = 0.015;
 /// Drift of all of x together from part to part: without it the filter stays stuck after a change of material.
 const DRIFT: f64 = 0.004;
 /// Another batch in the machine, unannounced: how likely that is before any part, and by how much (one sigma) all of x moves then.
@@ -398,6 +398,13 @@ pub(super) fn usual_springback(nominal: &Nominal, radius_mm: f64) -> f64 {
     let usual_radius_mm = 2.0 * nominal.od_mm;
     let moved = nominal.material.usual_springback_rad + elastic(radius_mm) - elastic(usual_radius_mm);
     moved.max(0.3 * DEGREE)
+}
+
+/// What a bend of the part springs back by when nothing but its material is known: the law before anything was learned.
+pub(super) fn usual_at(nominal: &Nominal, bend: usize) -> f64 {
+    let bend = &nominal.lra.bends[bend];
+    let share = bend.angle_rad / (90.0 * DEGREE);
+    usual_springback(nominal, bend.radius_mm) * (SHAPE[0] + SHAPE[1] * share + SHAPE[2] * share.sqrt())
 }
 
 /// Elastic share of a bend angle, eta = M R / (E I), for a thin-walled tube bent fully plastic in a material

@@ -41,6 +41,22 @@ pub struct SetUp {
     pub lubrication: String,
 }
 
+/// What was changed before a tube.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Changed {
+    /// The batch of material.
+    Batch,
+    /// Die, mandrel, wiper, lubrication.
+    Tooling,
+    /// What is known of spring-back was imported.
+    Knowledge,
+    /// The table, by somebody else than the corrections.
+    Table,
+    /// An earlier table was gone back to.
+    RollBack,
+}
+
 /// One bent and scanned tube.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -55,6 +71,18 @@ pub struct Part {
     /// Identity of the scan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scan_id: Option<String>,
+    /// The table that had been answered for it, where `commanded` is what the machine held.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub answered: Option<CommandTable>,
+    /// Name of the program that ran.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub program: Option<String>,
+    /// What was changed before it: the first tube in tolerance from here on waits for approval.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub changed: Option<Changed>,
+    /// Somebody has looked at this tube and at its table, and lets the job go on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub approved: bool,
     /// Length that the tube was cut to.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cut_length_mm: Option<f64>,
@@ -64,6 +92,22 @@ pub struct Part {
 }
 
 impl Part {
+    /// A tube and the table that it was bent with; nothing else is known.
+    pub fn new(commanded: CommandTable, measured: MeasuredTube) -> Part {
+        Part {
+            commanded,
+            measured,
+            revision: None,
+            scan_id: None,
+            answered: None,
+            program: None,
+            changed: None,
+            approved: false,
+            cut_length_mm: None,
+            rescan: false,
+        }
+    }
+
     /// What two entries of the same scan have in common: its id, or the digest of its file.
     pub fn scan_identities(&self) -> impl Iterator<Item = &str> {
         let digest = Some(self.measured.scan_sha256.as_str()).filter(|s| s.len() == 64);

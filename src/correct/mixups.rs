@@ -3,7 +3,7 @@
 //! Beside `replay`, which holds each scan against the part (wrong hand, wrong part, bends missing).
 
 use super::history::History;
-use super::replay::{Replay, Used};
+use super::replay::{Job, Replay, Used};
 use super::verdict::{Code, Reason};
 use crate::inspect::Known;
 use crate::tube::Nominal;
@@ -56,6 +56,23 @@ fn revisions(history: &History) -> Option<Reason> {
         }
     }
     None
+}
+
+/// Whether the machine held another table than was answered for the newest tube, and nobody has approved that. The last straight does
+/// not count: not every machine keeps it.
+pub fn edited(job: &Job) -> Option<Reason> {
+    let newest = job.history.parts.last().filter(|part| !part.approved)?;
+    let machine = &job.limits.machine;
+    let steps = (machine.length_resolution_mm, machine.angle_resolution_rad);
+    let differences = newest.answered.as_ref()?.differences(&newest.commanded, steps);
+    let text = || {
+        format!(
+            "the machine did not hold the table that was answered ({}): somebody changed it there. Put it back, or approve this tube \
+             with the table as it is",
+            differences.join("; ")
+        )
+    };
+    (!differences.is_empty()).then(|| Reason::new(Code::TableEdited, text()))
 }
 
 /// Whether the newest tube is as the table before would have made it, and not as its own.

@@ -8,9 +8,11 @@
 //! What jobs leave behind is [`knowledge`], on disk by [`store`]; [`import`] puts in what others know, [`learned`] and
 //! [`summary`] say what is believed of a key.
 
+mod approval;
 mod belief;
 mod check;
 pub mod estimate;
+mod gates;
 pub mod history;
 pub mod import;
 pub mod knowledge;
@@ -31,8 +33,9 @@ pub mod store;
 pub mod summary;
 pub mod values;
 pub mod verdict;
+mod worse;
 
-pub use history::{History, Part, SetUp};
+pub use history::{Changed, History, Part, SetUp};
 pub use knowledge::Knowledge;
 pub use plan::Limits;
 pub use predicted::{Predicted, PredictedPoint};
@@ -96,12 +99,13 @@ fn decide(job: &Job, replay: &Replay) -> Answer {
     match (&replay.newest, replay.used.last()) {
         (Newest::Refused(reason), _) => held(job, replay, vec![reason.clone()]),
         (Newest::Used { outliers, .. }, Some(newest)) => {
-            if let Some(reason) = mixups::old_table(job.nominal, replay) {
+            if let Some(reason) = mixups::edited(job).or_else(|| mixups::old_table(job.nominal, replay)) {
                 return held(job, replay, vec![reason]);
             }
-            let doubts = doubts(job.nominal, newest, outliers);
+            let mut doubts = gates::doubts(job.nominal, newest, outliers);
+            doubts.extend(gates::scan_score(replay));
             if doubts.is_empty() {
-                batch_changed(job, replay, judged(job, replay, newest))
+                settled(job, replay, judged(job, replay, newest))
             } else {
                 answer(Verdict::Rescan, newest.commanded.clone(), replay, doubts)
             }
@@ -177,33 +181,6 @@ fn undecided(
     answer(Verdict::Correct, in_force, replay, reasons)
 }
 
-/// Measurements that nothing should be concluded from: too uncertain, or unlike this bend's others.
-fn doubts(nominal: &Nominal, newest: &Used, outliers: &[estimate::Outlier]) -> Vec<Reason> {
-    let deg = f64::to_degrees;
-    let tolerance = nominal.tolerance.angle_rad;
-    let bends = newest.measured.bends.iter().enumerate();
-    let uncertain = bends.filter(|(_, b)| 2.0 * b.angle_sigma_rad > tolerance).map(|(i, b)| {
-        let text = format!(
-            "angle {} is known to +-{:.2} degrees (one sigma) only, tolerance is {:.2}: scan both its straights again",
-            i + 1,
-            deg(b.angle_sigma_rad),
-            deg(tolerance)
-        );
-        Reason::at(Code::TooUncertain, i, text)
-    });
-    let odd = outliers.iter().map(|o| {
-        let text = format!(
-            "bend {}: spring-back {:.2} degrees where {:.2} +-{:.2} is expected: scan again; if it stays, look at clamp and mandrel",
-            o.bend + 1,
-            deg(o.found_rad),
-            deg(o.expected_rad.value),
-            deg(o.expected_rad.sigma)
-        );
-        Reason::at(Code::Outlier, o.bend, text)
-    });
-    uncertain.chain(odd).collect()
-}
-
 /// The same tube with its last straight as long as wanted: that end is the cut length's matter.
 fn trimmed(measured: &MeasuredTube, nominal: &Nominal) -> MeasuredTube {
     let mut out = measured.clone();
@@ -239,6 +216,22 @@ fn cut_length(whole: &MeasuredTube, job: &Job) -> Option<Reason> {
         off.abs()
     );
     Some(Reason::new(Code::CutLength, text))
+}
+
+/// What is judged, unless a person has to look first: at tubes that changed, at corrections that do harm, at the first good
+/// tube after a change.
+fn settled(job: &Job, replay: &Replay, judged: Answer) -> Answer {
+    // First: a machine that turns every correction round looks like one change of batch after the other.
+    if judged.verdict == Verdict::Correct
+        && let Some((table, reason)) = worse::worse_twice(job.nominal, replay)
+    {
+        return answer(Verdict::Hold, table, replay, vec![reason]);
+    }
+    let judged = batch_changed(job, replay, judged);
+    let awaited = approval::awaited(job.history).filter(|_| judged.verdict == Verdict::InTolerance);
+    let Some(reason) = awaited else { return judged };
+    let reasons = std::iter::once(reason).chain(judged.reasons).collect();
+    Answer { verdict: Verdict::Hold, reasons, ..judged }
 }
 
 /// Tubes that suddenly spring back otherwise, all bends alike, are another batch, or the set-up was changed: somebody has to look, and

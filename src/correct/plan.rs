@@ -1,5 +1,6 @@
 //! From belief to table: dead band, step limit, total limit, the machine's range.
 
+use super::estimate;
 use super::replay::{Model, Used};
 use super::shape::{Case, shaped};
 use super::verdict::{Code, Reason};
@@ -23,7 +24,7 @@ pub struct Limits {
     pub step_length_mm: f64,
     /// The same for a rotation.
     pub step_rotation_rad: f64,
-    /// Farthest that an angle may go from the nominal.
+    /// Farthest that an angle may go from the nominal, and over it by what the material usually springs back besides.
     pub total_angle_rad: f64,
     /// The same for a feed.
     pub total_length_mm: f64,
@@ -122,6 +123,11 @@ pub(super) fn angle_step(model: &Model, limits: &Limits, i: usize) -> f64 {
 /// The same for a feed.
 pub(super) fn length_step(model: &Model, limits: &Limits, i: usize) -> f64 {
     limits.step_length_mm.max(3.0 * model.lengths.surprise_sigma_mm(i))
+}
+
+/// How far an angle may be under and over the nominal. Titanium springs back by what would be a gross error in steel.
+pub(super) fn total_angle(nominal: &Nominal, limits: &Limits, i: usize) -> (f64, f64) {
+    (limits.total_angle_rad, limits.total_angle_rad + estimate::usual_at(nominal, i))
 }
 
 /// A turn that the scan shows well enough to correct it.
@@ -265,8 +271,10 @@ pub fn violations(table: &CommandTable, nominal: &Nominal, limits: &Limits) -> V
     let deg = f64::to_degrees;
     for (i, (row, wanted)) in table.bends.iter().zip(&nominal.lra.bends).enumerate() {
         let turn = wrap_angle(row.rotation_rad - wanted.rotation_rad);
+        let (under, over) = total_angle(nominal, limits, i);
+        let off = row.angle_rad - wanted.angle_rad;
         let total = [
-            ("angle", deg(row.angle_rad - wanted.angle_rad), deg(limits.total_angle_rad), "degrees"),
+            ("angle", deg(off), deg(if off < 0.0 { under } else { over }), "degrees"),
             ("rotation", deg(turn), deg(limits.total_rotation_rad), "degrees"),
             ("feed", row.length_mm - wanted.length_mm, limits.total_length_mm, "mm"),
         ];

@@ -15,6 +15,8 @@ use crate::tube::{CommandTable, Lra, MeasuredTube, Nominal};
 /// A part that taught something.
 #[derive(Debug, Clone)]
 pub struct Used {
+    /// Which part of the history, from 1.
+    pub number: usize,
     /// Its table.
     pub commanded: CommandTable,
     /// Its measurement in the nominal's direction.
@@ -117,6 +119,7 @@ pub fn replay(job: &Job, turn_newest: bool) -> Replay {
                 };
                 let outliers = out.model.learn(nominal, &part.commanded, &fused);
                 out.used.push(Used {
+                    number: i + 1,
                     commanded: part.commanded.clone(),
                     measured: fused.measured,
                     outliers: outliers.iter().map(|o| o.bend).collect(),
@@ -174,6 +177,11 @@ fn oriented(job: &Job, part: &Part, model: &Model, turn: bool) -> Result<(Measur
     if part.commanded.bends.len() != wanted {
         let text = format!("the commanded table has {} bends, the part {wanted}", part.commanded.bends.len());
         return Err(Reason::new(Code::Program, text + ": which program ran?"));
+    }
+    if let Some(other) = part.program.as_ref().filter(|program| **program != nominal.name) {
+        let text =
+            format!("it was bent with program {other:?}, this part's is {:?}: load that one", nominal.name);
+        return Err(Reason::new(Code::Program, text));
     }
     if let Some(off) = plan::violations(&part.commanded, nominal, limits).first() {
         let text = format!("the commanded table is not this part's: {}", off.text);

@@ -17,7 +17,7 @@ const DEGREE: f64 = std::f64::consts::PI / 180.0;
 /// Prior of b and of a bend's own, and the scatter of the axis.
 const BACKLASH: Known = Known { value: 0.1 * DEGREE, sigma: 0.1 * DEGREE };
 const RESIDUAL: Known = Known { value: 0.0, sigma: 0.04 * DEGREE };
-const AXIS_SCATTER_RAD: f64 = 0.08 * DEGREE;
+pub(super) const AXIS_SCATTER_RAD: f64 = 0.08 * DEGREE;
 /// What a bend's own drifts by per part.
 const DRIFT_RAD: f64 = 0.005 * DEGREE;
 /// Beyond this many sigmas a rotation counts less.

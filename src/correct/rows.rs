@@ -28,7 +28,12 @@ impl Rows {
     pub fn merge(&self, history: &History) -> History {
         let mut out = history.clone();
         let fitting = out.parts.iter_mut().filter(|p| p.commanded.bends.len() == self.bends.len());
-        fitting.for_each(|p| p.commanded = self.merge_table(&p.commanded));
+        fitting.for_each(|p| {
+            p.commanded = self.merge_table(&p.commanded);
+            let answered = p.answered.take();
+            p.answered =
+                answered.map(|t| if t.bends.len() == self.bends.len() { self.merge_table(&t) } else { t });
+        });
         out
     }
 

@@ -55,8 +55,8 @@ impl Case<'_> {
             Value { best, low, high, tolerance, step, room }
         };
         let angle = |i: usize| {
-            let range =
-                self.range(i, nominal.lra.bends[i].angle_rad, |row| row.angle_rad, limits.total_angle_rad);
+            let total = plan::total_angle(nominal, limits, i);
+            let range = self.range(i, nominal.lra.bends[i].angle_rad, |row| row.angle_rad, total);
             let range = within(range(plan::angle_step(model, limits, i)), (0.0, machine.max_angle_rad));
             let best = model.springback.command_for(i, nominal.lra.bends[i].angle_rad);
             value(
@@ -74,7 +74,8 @@ impl Case<'_> {
             let current = self.newest.map_or(best, |newest| newest.commanded.bends[i].rotation_rad);
             let best = current + wrap_angle(best - current);
             let wanted = best + wrap_angle(wanted - best);
-            let range = self.range(i, wanted, |row| row.rotation_rad, limits.total_rotation_rad);
+            let total = (limits.total_rotation_rad, limits.total_rotation_rad);
+            let range = self.range(i, wanted, |row| row.rotation_rad, total);
             let most = machine.max_rotation_rad;
             let range = within(range(limits.step_rotation_rad), (-most, most));
             let seen = i > 0 && self.newest.is_none_or(|n| plan::turn_seen(n, nominal, i).is_some());
@@ -84,8 +85,8 @@ impl Case<'_> {
         let angles: Vec<Value> = (0..table.bends.len()).map(angle).collect();
         let aims: Vec<f64> = angles.iter().map(Value::aim).collect();
         let length = |i: usize| {
-            let range =
-                self.range(i, nominal.lra.bends[i].length_mm, |row| row.length_mm, limits.total_length_mm);
+            let total = (limits.total_length_mm, limits.total_length_mm);
+            let range = self.range(i, nominal.lra.bends[i].length_mm, |row| row.length_mm, total);
             let most = (plan::shortest_feed(machine, i), machine.max_length_mm);
             let range = within(range(plan::length_step(model, limits, i)), most);
             let best = model.lengths.command_for(i, &aims);
@@ -95,17 +96,17 @@ impl Case<'_> {
         (0..table.bends.len()).flat_map(|i| [length(i), rotation(i), angles[i]]).collect()
     }
 
-    /// From the wanted value by no more than `total`, from the one in force by no more than a step.
+    /// From the wanted value by no more than `total` (under, over), from the one in force by no more than a step.
     fn range(
         &self,
         i: usize,
         wanted: f64,
         of: fn(&CommandRow) -> f64,
-        total: f64,
+        (under, over): (f64, f64),
     ) -> impl Fn(f64) -> (f64, f64) {
         let current = self.newest.map(|newest| of(&newest.commanded.bends[i]));
         move |step| {
-            let total = (wanted - total, wanted + total);
+            let total = (wanted - under, wanted + over);
             current.map_or(total, |current| within(total, (current - step, current + step)))
         }
     }

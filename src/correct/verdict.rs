@@ -31,10 +31,16 @@ pub enum Code {
     SameScan,
     /// The commanded table is not this part's.
     Program,
+    /// The machine held another table than was answered: somebody edited it there.
+    TableEdited,
     /// The tube was bent with another revision of the table than it is said to be.
     Revision,
     /// All bends spring back by another factor than before.
     BatchChanged,
+    /// Corrected tables made it worse twice: back to the last good one.
+    WorseTwice,
+    /// The first good tube after a change, which nobody has approved yet.
+    Unapproved,
     /// The scan shows another number of bends.
     BendCount,
     /// The mirror image fits better.
@@ -45,6 +51,12 @@ pub enum Code {
     Direction,
     /// The scan's sigma leaves no room in the tolerance.
     TooUncertain,
+    /// The points of a straight scatter too much about it.
+    StraightFit,
+    /// The axes beside a bend miss each other.
+    NearestPass,
+    /// The scan is worse than this part's usual.
+    ScanScore,
     /// A bend that does not fit what it did before.
     Outlier,
     /// Check points were not measured, or not well enough: another scan can tell.
@@ -112,7 +124,8 @@ impl Reason {
 pub struct Answer {
     /// What to do next.
     pub verdict: Verdict,
-    /// The table to bend with, or in rescan and hold the one in force.
+    /// The table to bend with; in rescan and hold the one in force, but where a hold proposes one for approval (another batch, worse
+    /// twice).
     pub commanded: CommandTable,
     /// Predicted commanded minus formed angle per bend at this table.
     pub springback_deg: Vec<f64>,

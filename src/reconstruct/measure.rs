@@ -95,6 +95,8 @@ pub fn measure(fit: &mut Fit, end_points: EndPoints, doubt: &RadiusDoubt, moved_
         bends,
         intersection_mm: corners.iter().map(|c| c.map(|c| c.0)).collect(),
         intersection_sigma_mm: corners.iter().map(|c| c.map(|c| c.1)).collect(),
+        straight_rms_mm: Vec::new(),
+        nearest_pass_mm: Vec::new(),
         first_cut_rad: first_cut.map(|c| c.0),
         first_cut_sigma_rad: first_cut.map(|c| c.1),
         last_cut_rad: last_cut.map(|c| c.0),

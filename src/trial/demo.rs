@@ -186,7 +186,7 @@ fn ready(state: &State) -> bool {
 
 fn stopped(state: &State) -> Result<(), TrialError> {
     match state {
-        State::Held(reason) => Err(TrialError::Held(reason.clone())),
+        State::Held(hold) => Err(TrialError::Held(hold.reason.clone())),
         State::Faulted(fault) => Err(TrialError::Held(fault.reason.clone())),
         _ => Ok(()),
     }

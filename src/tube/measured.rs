@@ -101,6 +101,12 @@ pub struct MeasuredTube {
     /// Their sigmas.
     #[serde(default)]
     pub intersection_sigma_mm: Vec<Option<f64>>,
+    /// Root mean square distance of each straight's points from its surface; one per straight, or none at all.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub straight_rms_mm: Vec<Option<f64>>,
+    /// How far the axes beside each bend pass each other; only from programs that measure each straight by itself.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub nearest_pass_mm: Vec<Option<f64>>,
     /// Angle of the first end's face from square, where the scan shows it. An obliquely cut tube's length is measured
     /// on its axis.
     #[serde(
@@ -174,6 +180,8 @@ impl MeasuredTube {
             bends: lra.bends.iter().map(bend).collect(),
             intersection_sigma_mm: corners.iter().map(|c| c.map(|_| 0.0)).collect(),
             intersection_mm: corners,
+            straight_rms_mm: Vec::new(),
+            nearest_pass_mm: Vec::new(),
             first_cut_rad: None,
             first_cut_sigma_rad: None,
             last_cut_rad: None,
@@ -231,6 +239,8 @@ impl MeasuredTube {
         }
         out.intersection_mm.reverse();
         out.intersection_sigma_mm.reverse();
+        out.straight_rms_mm.reverse();
+        out.nearest_pass_mm.reverse();
         for bend in out.decisions.iter_mut().filter_map(|d| d.bend.as_mut()) {
             *bend = (n + 1).saturating_sub(*bend);
         }

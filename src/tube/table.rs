@@ -52,6 +52,31 @@ impl CommandTable {
         Lra { bends: self.bends.iter().enumerate().map(bend).collect(), last_length_mm: self.last_length_mm }
     }
 
+    /// What another table has otherwise, value by value, by more than a step (length in mm, angle in radians); lasts straights aside.
+    pub fn differences(&self, found: &CommandTable, (step_mm, step_rad): (f64, f64)) -> Vec<String> {
+        /// What writing values down and reading them back may leave.
+        const ROUNDING: f64 = 1e-6;
+        if self.bends.len() != found.bends.len() {
+            return vec![format!("{} bends instead of {}", found.bends.len(), self.bends.len())];
+        }
+        let mut out = Vec::new();
+        for (i, (own, found)) in self.bends.iter().zip(&found.bends).enumerate() {
+            let degree = 1.0_f64.to_radians();
+            let values = [
+                ("feed", own.length_mm, found.length_mm, step_mm, "mm", 1.0),
+                ("rotation", own.rotation_rad, found.rotation_rad, step_rad, "degrees", degree),
+                ("angle", own.angle_rad, found.angle_rad, step_rad, "degrees", degree),
+            ];
+            for (what, own, found, step, unit, size) in values {
+                if (own - found).abs() > step + ROUNDING {
+                    let (own, found) = (own / size, found / size);
+                    out.push(format!("{what} {} is {found:.2} {unit} instead of {own:.2}", i + 1));
+                }
+            }
+        }
+        out
+    }
+
     /// Refuses what no machine can be told (see [`Lra::validate`]).
     pub fn validate(&self) -> Result<(), TubeError> {
         self.to_lra(&[1.0]).validate()

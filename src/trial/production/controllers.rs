@@ -107,12 +107,10 @@ impl Controller for Benderd {
 
     fn next(&mut self, scanned: Scanned) -> Said {
         self.history.parts.push(Part {
-            commanded: scanned.commanded,
-            measured: scanned.measured,
             revision: Some(scanned.revision),
             scan_id: Some(scanned.scan_id),
-            cut_length_mm: None,
             rescan: scanned.rescan,
+            ..Part::new(scanned.commanded, scanned.measured)
         });
         let answer = self.step();
         Said { table: answer.commanded, verdict: Some(answer.verdict) }

@@ -32,14 +32,7 @@ impl Stand {
             let formed = self.plant.bend(&commanded, nominal.lra.developed_length_mm());
             let measured = Scanner::good().scan(&formed.lra, nominal.od_mm / 2.0, &mut self.rng);
             let scan_id = Some(format!("{name}, tube {}", history.parts.len() + 1));
-            history.parts.push(Part {
-                commanded,
-                measured,
-                revision: None,
-                scan_id,
-                cut_length_mm: None,
-                rescan: false,
-            });
+            history.parts.push(Part { scan_id, ..Part::new(commanded, measured) });
         }
         history
     }
