@@ -42,7 +42,7 @@ pub use predicted::{Predicted, PredictedPoint};
 pub use verdict::{Answer, Code, Reason, Verdict};
 
 use crate::inspect::{self, Inspection};
-use crate::tube::{CommandTable, MeasuredTube, Nominal};
+use crate::tube::{Bend, CommandRow, CommandTable, MeasuredTube, Nominal};
 use predicted::foretold;
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
@@ -50,6 +50,8 @@ use shape::{Case, shaped};
 
 /// A change of all bends together that is likelier than this is no chance.
 const CERTAIN: f64 = 0.995;
+/// An angle is surely off, or out, by so many standard deviations of the next tube's.
+const SURE_SIGMAS: f64 = 2.0;
 
 /// One step of the loop: what the history says, and the table to bend with next.
 pub fn step(nominal: &Nominal, history: &History, knowledge: &Knowledge, limits: &Limits) -> Answer {
@@ -135,11 +137,15 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
         Err(e) => return held(job, replay, vec![Reason::new(Code::Unusable, e.to_string())]),
     };
     let mut reasons: Vec<Reason> = cut_length(&newest.measured, job).into_iter().collect();
-    if inspection.verdict == inspect::Verdict::InTolerance {
-        return answer(Verdict::InTolerance, in_force, replay, reasons);
-    }
     let (table, changes) = plan::next(&replay.model, nominal, newest, job.limits);
     let violations = plan::violations(&table, nominal, job.limits);
+    if inspection.verdict == inspect::Verdict::InTolerance {
+        let narrow = narrow(nominal, replay, &in_force);
+        if narrow.is_empty() || table == in_force || !violations.is_empty() {
+            return answer(Verdict::InTolerance, in_force, replay, reasons);
+        }
+        reasons.extend(narrow);
+    }
     if !violations.is_empty() {
         return held(job, replay, violations);
     }
@@ -153,6 +159,28 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
         return answer(Verdict::Correct, in_force, replay, reasons);
     }
     undecided(job, replay, newest, reasons, &inspection)
+}
+
+/// Angles that a table surely makes off, and so far that the next tube may be out though this one is not.
+fn narrow(nominal: &Nominal, replay: &Replay, in_force: &CommandTable) -> Vec<Reason> {
+    let deg = f64::to_degrees;
+    let tolerance = nominal.tolerance.angle_rad;
+    let rows = in_force.bends.iter().zip(&nominal.lra.bends).enumerate();
+    let reason = |(i, (row, wanted)): (usize, (&CommandRow, &Bend))| {
+        let next = replay.model.springback.next_at(i, row.angle_rad);
+        let off = row.angle_rad - next.value - wanted.angle_rad;
+        let doubt = SURE_SIGMAS * next.sigma;
+        let text = format!(
+            "angle {}: this tube is good, but this table bends {:+.2} +-{:.2} degrees off (one sigma), tolerance is {:.2}: the next \
+             may not be",
+            i + 1,
+            deg(off),
+            deg(next.sigma),
+            deg(tolerance)
+        );
+        (off.abs() > doubt && off.abs() + doubt > tolerance).then(|| Reason::at(Code::Margin, i, text))
+    };
+    rows.filter_map(reason).collect()
 }
 
 /// Neither good nor bad for certain, and nothing to change: scanned again where that can tell, else left as it is.

@@ -63,6 +63,8 @@ pub enum Code {
     Unseen,
     /// Neither shown to be good nor to be bad, and another scan would not change that.
     Unproven,
+    /// The tube is good; by what is known of its table the next ones may not be.
+    Margin,
     /// An angle changes.
     Angle,
     /// A feed changes.

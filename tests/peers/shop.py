@@ -93,7 +93,7 @@ def job(binary, part, seed, folder):
 def main():
     binary, part = sys.argv[1:3]
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(1, int(sys.argv[3] if len(sys.argv) > 3 else 3) + 1):
+        for seed in range(1, int(sys.argv[3] if len(sys.argv) > 3 else 12) + 1):
             job(binary, part, seed, Path(folder))
 
 
