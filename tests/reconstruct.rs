@@ -56,6 +56,17 @@ fn the_demo_part_comes_back_within_its_sigmas() {
     assert!(off.iter().all(|z| *z < 6.0), "{off:?}");
 }
 
+/// What `correct` asks for another scan by.
+#[test]
+fn each_straight_says_how_well_its_points_lie_on_it() {
+    let found = measured(&scanned(15_000, 1).cloud());
+    let all: Vec<f64> = found.straight_rms_mm.iter().map(|rms| rms.unwrap()).collect();
+    assert_eq!(all.len(), found.bends.len() + 1);
+    let (least, most) =
+        (all.iter().copied().fold(f64::MAX, f64::min), all.iter().copied().fold(0.0, f64::max));
+    assert!(least > 0.5 * found.residual_median_mm && most < 1.5 * least, "{all:?}");
+}
+
 #[test]
 fn the_end_lengths_are_the_scanned_extent() {
     let truth = nominal().lra;

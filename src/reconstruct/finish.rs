@@ -17,6 +17,7 @@ use super::profile;
 use super::realign;
 use super::search::UNSURE;
 use super::shade;
+use super::straights;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
 use super::undecided::{self, widened};
@@ -137,6 +138,7 @@ fn finish_as_chosen(
         return Err(ReconstructError::EndsInBend { bend });
     }
     measured.residual_median_mm = best.median_mm;
+    measured.straight_rms_mm = straights::rms_mm(&whole, &best);
     measured.decisions.clone_from(&chosen.decisions);
     measured.decisions.extend(flattening::decision(&best, correlation.near));
     measured.points_total = whole.file_len();

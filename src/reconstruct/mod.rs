@@ -53,6 +53,7 @@ mod seen;
 mod shade;
 pub mod simplify;
 mod square;
+mod straights;
 mod strangers;
 mod stretches;
 mod stripes;
