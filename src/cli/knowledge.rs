@@ -230,6 +230,7 @@ fn numbered<'a>(
 }
 
 fn is_json(path: &Path) -> anyhow::Result<bool> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("{}: cannot be read", path.display()))?;
+    let text =
+        std::fs::read_to_string(path).with_context(|| format!("{}: cannot be read", path.display()))?;
     Ok(text.trim_start().starts_with('{'))
 }

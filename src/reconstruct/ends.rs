@@ -133,12 +133,7 @@ pub fn find(mut points: Vec<Point3<f64>>, radius_mm: f64, noise_mm: f64, passes_
 
 /// Whether the outside goes on past a plane (where on the axis, slope) somewhere: an outline is then that of a jaw that hides
 /// the rest, or of a patch that was not scanned.
-fn goes_on(
-    surface: &[Point3<f64>],
-    (at_mm, slope): (f64, [f64; 2]),
-    radius_mm: f64,
-    near_mm: f64,
-) -> bool {
+fn goes_on(surface: &[Point3<f64>], (at_mm, slope): (f64, [f64; 2]), radius_mm: f64, near_mm: f64) -> bool {
     let beyond_mm = near_mm.max(BEYOND_RADII * radius_mm);
     let (mut before, mut beyond) = (0, 0);
     for p in surface {

@@ -185,12 +185,7 @@ struct Moved {
 
 /// The passes moved as a tube about as this one asks for, which scattered by `noise_mm` before. None where there is one pass only,
 /// and where the tube scatters no less after: then they were moved by what was missing of its shape.
-fn moved(
-    shown: &Shown,
-    about: &Structure,
-    noise_mm: f64,
-    guide: Option<&Nominal>,
-) -> Option<Moved> {
+fn moved(shown: &Shown, about: &Structure, noise_mm: f64, guide: Option<&Nominal>) -> Option<Moved> {
     let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, about));
     if passes.is_empty() {
         return None;

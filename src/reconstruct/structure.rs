@@ -142,7 +142,8 @@ pub fn closest(shown: &Shown, chosen: &Structure) -> Option<Structure> {
     let finest = TOLERANCES.into_iter().fold(f64::INFINITY, f64::min);
     let model = start(shown.polygon, finest * shown.radius_mm, shown.radius_mm)?;
     let line = CentreLine::measure(shown.sample, &model, true);
-    let jury = Jury { line, correlation: 1.0, prior: None, decisions: Vec::new(), undecided: Undecided::new() };
+    let jury =
+        Jury { line, correlation: 1.0, prior: None, decisions: Vec::new(), undecided: Undecided::new() };
     let model = jury.fit(&model, FULL_STEPS, f64::INFINITY).model;
     Some(Structure { model, ..chosen.clone() })
 }
