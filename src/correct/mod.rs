@@ -42,7 +42,7 @@ pub use predicted::{Predicted, PredictedPoint};
 pub use verdict::{Answer, Code, Reason, Verdict};
 
 use crate::inspect::{self, Inspection};
-use crate::tube::{Bend, CommandRow, CommandTable, MeasuredTube, Nominal};
+use crate::tube::{Bend, CommandTable, MeasuredTube, Nominal};
 use predicted::foretold;
 use replay::{Job, Newest, Replay, Used, replay};
 use rows::Rows;
@@ -140,7 +140,7 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
     let (table, changes) = plan::next(&replay.model, nominal, newest, job.limits);
     let violations = plan::violations(&table, nominal, job.limits);
     if inspection.verdict == inspect::Verdict::InTolerance {
-        let narrow = narrow(nominal, replay, &in_force);
+        let narrow = narrow(nominal, replay, newest);
         if narrow.is_empty() || table == in_force || !violations.is_empty() {
             return answer(Verdict::InTolerance, in_force, replay, reasons);
         }
@@ -161,26 +161,29 @@ fn judged(job: &Job, replay: &Replay, newest: &Used) -> Answer {
     undecided(job, replay, newest, reasons, &inspection)
 }
 
-/// Angles that a table surely makes off, and so far that the next tube may be out though this one is not.
-fn narrow(nominal: &Nominal, replay: &Replay, in_force: &CommandTable) -> Vec<Reason> {
+/// Angles that the newest tube's table surely makes off, as it shows, and so far that the next may be out though this one is not.
+fn narrow(nominal: &Nominal, replay: &Replay, newest: &Used) -> Vec<Reason> {
     let deg = f64::to_degrees;
     let tolerance = nominal.tolerance.angle_rad;
-    let rows = in_force.bends.iter().zip(&nominal.lra.bends).enumerate();
-    let reason = |(i, (row, wanted)): (usize, (&CommandRow, &Bend))| {
-        let next = replay.model.springback.next_at(i, row.angle_rad);
-        let off = row.angle_rad - next.value - wanted.angle_rad;
+    let reason = |(i, wanted): (usize, &Bend)| {
+        let commanded_rad = newest.commanded.bends.get(i)?.angle_rad;
+        let seen = newest.measured.bends.get(i)?.angle_rad - wanted.angle_rad;
+        let next = replay.model.springback.next_at(i, commanded_rad);
+        let off = commanded_rad - next.value - wanted.angle_rad;
         let doubt = SURE_SIGMAS * next.sigma;
         let text = format!(
-            "angle {}: this tube is good, but this table bends {:+.2} +-{:.2} degrees off (one sigma), tolerance is {:.2}: the next \
+            "angle {}: this tube is good, but its table bends {:+.2} +-{:.2} degrees off (one sigma), tolerance is {:.2}: the next \
              may not be",
             i + 1,
             deg(off),
             deg(next.sigma),
             deg(tolerance)
         );
-        (off.abs() > doubt && off.abs() + doubt > tolerance).then(|| Reason::at(Code::Margin, i, text))
+        let shows = seen * off.signum() > 0.5 * off.abs();
+        let is_narrow = shows && off.abs() > doubt && off.abs() + doubt > tolerance;
+        is_narrow.then(|| Reason::at(Code::Margin, i, text))
     };
-    rows.filter_map(reason).collect()
+    nominal.lra.bends.iter().enumerate().filter_map(reason).collect()
 }
 
 /// Neither good nor bad for certain, and nothing to change: scanned again where that can tell, else left as it is.
