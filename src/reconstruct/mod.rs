@@ -183,10 +183,15 @@ struct Moved {
     found: (Structure, Vec<String>),
 }
 
-/// The passes moved as a tube about as this one asks for, which scattered by `noise_mm` before. None where there is one pass only,
+/// The passes moved as a tube about as this one asked for, which scattered by `noise_mm` before. None where there is one pass only,
 /// and where the tube scatters no less after: then they were moved by what was missing of its shape.
-fn moved(shown: &Shown, about: &Structure, noise_mm: f64, guide: Option<&Nominal>) -> Option<Moved> {
-    let (passes, gain) = in_pool(|| realign::realigned(&shown.whole, about));
+fn moved(
+    shown: &Shown,
+    about: &Structure,
+    (passes, gain): (Vec<ScanPass>, f64),
+    noise_mm: f64,
+    guide: Option<&Nominal>,
+) -> Option<Moved> {
     if passes.is_empty() {
         return None;
     }
@@ -221,9 +226,13 @@ fn by(
     begins(Stage::Structure);
     let mut shown = Shown::new(cloud, &scene, &sample);
     let (mut chosen, mut notes) = in_pool(|| choose(&mut shown, guide)).ok_or_else(not_bent)?;
-    let closest = || structure::closest(&shown, &chosen);
-    let moved = moved(&shown, &chosen, chosen.noise_mm, guide)
-        .or_else(|| moved(&shown, &in_pool(closest)?, chosen.noise_mm, guide));
+    let asked = |about: &Structure| in_pool(|| realign::realigned(&shown.whole, about));
+    let first = asked(&chosen);
+    let several = !first.0.is_empty();
+    let moved = moved(&shown, &chosen, first, chosen.noise_mm, guide).or_else(|| {
+        let closest = several.then(|| in_pool(|| structure::closest(&shown, &chosen)))??;
+        moved(&shown, &closest, asked(&closest), chosen.noise_mm, guide)
+    });
     if let Some(Moved { passes, sample, flattening, .. }) = &moved {
         let flattening = flattening.clone();
         shown = Shown { whole: shown.whole.moved(passes), sample, flattening, ..shown };
