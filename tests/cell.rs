@@ -423,6 +423,15 @@ fn a_roll_back_is_not_delivered_over_a_table_that_somebody_changed_meanwhile() {
 }
 
 #[test]
+fn disarmed_in_between_arming_approves_nothing_that_was_not_said_again() {
+    let mut b = held_for(Code::Unapproved);
+    b.on(Event::Disarm);
+    b.on(Event::Arm);
+    assert!(matches!(b.read(2)[..], [Action::Decide(_)]));
+    assert!(!b.cell.history()[0].approved);
+}
+
+#[test]
 fn arming_after_the_first_good_tube_of_a_change_approves_it() {
     let mut b = held_for(Code::Unapproved);
     assert!(!b.cell.history()[0].approved);

@@ -14,7 +14,8 @@ use tokio::time::Instant;
 
 use super::event::{Action, Decision, Dwell, Event, InForce, Ticket};
 use super::journalling::record;
-use super::machine::{Cell, Hold, Part, State};
+use super::machine::{Cell, Part};
+use super::state::{Hold, State};
 use super::worker::{Ask, Worker};
 use crate::arm::{ArmError, Filing, ScanFile, ScanSource};
 use crate::bender::{Bender, Job};

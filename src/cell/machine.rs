@@ -2,13 +2,13 @@
 //!
 //! Every transition is a named method; [`Cell::on`] only says which event leads to which. What is safe about
 //! it: a table is delivered from `Deciding`, or with a person's approval when the cell is armed, in both cases after the
-//! machine was just read, and a cell comes up, and comes back from every fault, disarmed. All transitions at a glance are in the snapshot beside
-//! `tests/cell.rs`.
+//! machine was just read, and a cell comes up, and comes back from every fault, disarmed. All transitions at a glance are in the
+//! snapshot beside `tests/cell.rs`.
 
-use std::fmt;
 use std::time::Duration;
 
 use super::event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
+use super::state::{Fault, Hold, Purpose, State};
 use crate::arm::ScanFile;
 use crate::bender::{Operation, TableId};
 use crate::config::Mode;
@@ -21,38 +21,6 @@ const MAX_UNUSABLE: u32 = 3;
 /// Parts remembered; older ones have no say in the next table.
 const MAX_HISTORY: usize = 200;
 
-/// Where the cell is.
-#[derive(Debug, Clone, PartialEq)]
-pub enum State {
-    /// Nothing is measured or written until somebody arms the cell.
-    Disarmed,
-    /// The machine is being read.
-    Reading(Purpose),
-    /// A table is in force; the next scan is waited for.
-    Ready,
-    /// The same, and the last part was good.
-    InTolerance,
-    /// A scan is being measured.
-    Measuring(ScanFile),
-    /// The next step is being decided, after this scan (None: for the first piece).
-    Deciding(Option<ScanFile>),
-    /// A table is on its way.
-    Delivering(CommandTable),
-    /// A person must look; arming again goes on.
-    Held(Hold),
-    /// The machine cannot be reached; it is read again by itself, and comes back disarmed.
-    Faulted(Box<Fault>),
-}
-
-/// Why a person must look.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Hold {
-    /// For machines, as in `benderd correct`'s reasons; none where the cell itself cannot go on.
-    pub code: Option<Code>,
-    /// For people.
-    pub reason: String,
-}
-
 /// What is approved by arming after a hold.
 #[derive(Debug, Clone, PartialEq)]
 enum Approval {
@@ -60,45 +28,6 @@ enum Approval {
     Tube,
     /// This earlier table is gone back to.
     RollBack(CommandTable),
-}
-
-/// Why the machine is being read.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Purpose {
-    /// To see who is there, after start or a fault.
-    Contact,
-    /// Before anything is decided.
-    Arming,
-    /// To see that the table in force is still ours before a part is judged by it.
-    Recall(ScanFile),
-    /// To learn what became of a delivery (None: it may not have come as far as the commit).
-    Resolve(Option<TableId>),
-}
-
-/// A machine that cannot be reached.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Fault {
-    /// What happened.
-    pub reason: String,
-    /// What to find out at the next contact.
-    pub then: Purpose,
-}
-
-impl fmt::Display for State {
-    /// The state in the operator's words.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            State::Disarmed => f.write_str("disarmed"),
-            State::Reading(_) => f.write_str("reading the machine"),
-            State::Ready => f.write_str("waiting for a scan"),
-            State::InTolerance => f.write_str("in tolerance, waiting for a scan"),
-            State::Measuring(_) => f.write_str("measuring"),
-            State::Deciding(_) => f.write_str("deciding"),
-            State::Delivering(_) => f.write_str("delivering a table"),
-            State::Held(hold) => write!(f, "held: {}", hold.reason),
-            State::Faulted(fault) => write!(f, "faulted: {}", fault.reason),
-        }
-    }
 }
 
 /// One part that was bent and measured.
@@ -251,6 +180,10 @@ impl Cell {
     }
 
     fn enter(&mut self, state: State) {
+        // Only who arms out of the hold itself has read what is approved so.
+        if matches!(state, State::Disarmed | State::Faulted(_)) {
+            self.approval = None;
+        }
         self.state = state;
         self.since = self.now;
     }
@@ -303,7 +236,10 @@ impl Cell {
         match (why, other_program) {
             (Purpose::Contact, _) => self.contacted(),
             (Purpose::Resolve(intent), _) => self.resolved(intent, found),
-            (Purpose::Arming, Some(reason)) => self.hold(Some(Code::Program), reason),
+            (Purpose::Arming, Some(reason)) => {
+                self.approval = None;
+                self.hold(Some(Code::Program), reason)
+            }
             (Purpose::Recall(scan), Some(reason)) => self.scan_of_other_program(scan, reason),
             (Purpose::Arming, None) if ours => self.approved(),
             (Purpose::Arming, None) => self.begin_job(),

@@ -1,7 +1,8 @@
 //! The closed loop of one bending cell: a scan comes in, a corrected table goes out, when that may be.
 //!
 //! ```text
-//! event, machine   the pure state machine: what may happen when
+//! event, state, machine
+//!                  the pure state machine: what may happen when
 //! driver           performs what it asks for: scans, measuring, deciding, journal
 //! worker           the machine's side of that, one thing at a time
 //! intents          deliveries in the journal
@@ -16,11 +17,13 @@ mod journalling;
 mod machine;
 mod places;
 mod setup;
+mod state;
 mod worker;
 
 pub use chain::{Chain, MeasuredScan, measure, measure_scan};
 pub use driver::{Command, Craft, Decided, Driver, Identity, Notice};
 pub use event::{Action, Decision, Delivered, Dwell, Event, InForce, Ticket};
 pub use intents::JournalledIntents;
-pub use machine::{Cell, Fault, Hold, Part, Purpose, State};
+pub use machine::{Cell, Part};
 pub use setup::{Setup, SetupError};
+pub use state::{Fault, Hold, Purpose, State};

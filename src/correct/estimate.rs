@@ -205,7 +205,7 @@ impl Springback {
             .zip(&seen.found)
             .map(|(row, found)| found - self.belief.predict(row).value)
             .collect();
-        let median = median(seen.rows.iter().zip(&off).map(|(row, off)| off / factor(row)).collect());
+        let median = median(seen.rows.iter().zip(&off).map(|(row, off)| off / factor(row)).collect())?;
         let fits = |i: &usize| {
             let sigma = seen.variances[*i].sqrt().hypot(RESIDUAL_SIGMA_RAD);
             (off[*i] - median * factor(&seen.rows[*i])).abs() < REJECT * sigma
@@ -370,10 +370,11 @@ fn along(shape: [f64; 3], unknowns: usize) -> DVector<f64> {
     direction
 }
 
-/// Of an even number the middle of the middle two.
-fn median(mut values: Vec<f64>) -> f64 {
+/// Of an even number the middle of the middle two, of none none.
+pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
     values.sort_by(f64::total_cmp);
-    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
+    let (below, above) = (values.get(values.len().saturating_sub(1) / 2)?, values.get(values.len() / 2)?);
+    Some(0.5 * (below + above))
 }
 
 /// Of what all bends of a tube have in common: a share of their spring-back. Not of what each was found to be: the fit would
@@ -384,7 +385,8 @@ fn common_noise(rows: &[DVector<f64>], found: &[f64], share: f64) -> DMatrix<f64
     }
     let usual = along(SHAPE, rows[0].len());
     let expected: Vec<f64> = rows.iter().map(|row| row.dot(&usual)).collect();
-    let factor = median(found.iter().zip(&expected).map(|(found, expected)| found / expected).collect());
+    let shares = found.iter().zip(&expected).map(|(found, expected)| found / expected);
+    let factor = median(shares.collect()).unwrap_or_default();
     let column = DVector::from_vec(expected) * (factor * share);
     &column * column.transpose()
 }

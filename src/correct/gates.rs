@@ -3,7 +3,7 @@
 //! An end that was not scanned is no reason by itself: its feed stays as it is, and only a tube that is good otherwise is
 //! scanned again for it (`Unseen`). Short straights need no gate: their bends' sigmas say what they are worth.
 
-use super::estimate::Outlier;
+use super::estimate::{Outlier, median};
 use super::replay::{Replay, Used};
 use super::verdict::{Code, Reason};
 use crate::tube::{MeasuredTube, Nominal};
@@ -113,9 +113,4 @@ pub fn scan_score(replay: &Replay) -> Option<Reason> {
         "this scan is worse than those before: {what}; see that arm and tube stand firm, clean the tube, scan it again"
     );
     Some(Reason::new(Code::ScanScore, text))
-}
-
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }

@@ -17,7 +17,6 @@ use super::profile;
 use super::realign;
 use super::search::UNSURE;
 use super::shade;
-use super::straights;
 use super::stretches::{Correlation, correlation};
 use super::structure::{Shown, Structure};
 use super::undecided::{self, widened};
@@ -28,6 +27,7 @@ use crate::tube::{Frame, MeasuredTube};
 /// Half of a scan's points usually lie no farther off than this, or than this share of the tube's radius.
 const USUAL_ROUGHNESS_MM: f64 = 0.1;
 const USUAL_ROUGHNESS_RADII: f64 = 0.02;
+
 /// An angle is never left open: a tube with one less certain than this was not measured.
 const MAX_ANGLE_SIGMA_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 
@@ -138,7 +138,7 @@ fn finish_as_chosen(
         return Err(ReconstructError::EndsInBend { bend });
     }
     measured.residual_median_mm = best.median_mm;
-    measured.straight_rms_mm = straights::rms_mm(&whole, &best);
+    measured.straight_rms_mm.clone_from(&best.straight_rms_mm);
     measured.decisions.clone_from(&chosen.decisions);
     measured.decisions.extend(flattening::decision(&best, correlation.near));
     measured.points_total = whole.file_len();

@@ -45,6 +45,8 @@ pub struct Fit {
     pub used: usize,
     /// Median size of their residuals.
     pub median_mm: f64,
+    /// Root mean square of each straight's, see [`Pass::straight_rms_mm`].
+    pub straight_rms_mm: Vec<Option<f64>>,
     /// Passes over the points.
     pub passes: usize,
     /// Why it stopped.
@@ -117,6 +119,7 @@ pub fn fit(sample: &mut impl Data, start: &TubeModel, effort: Effort) -> Fit {
         cost: state.pass.cost,
         used: state.pass.used(),
         median_mm: state.pass.median_mm(cutoff).unwrap_or(0.0),
+        straight_rms_mm: state.pass.straight_rms_mm(),
         model: state.model,
         stop: state.stop,
         parameters,
@@ -180,6 +183,7 @@ pub fn polish(
                 cost: pass.cost,
                 used: pass.used(),
                 median_mm: pass.median_mm(cutoff_mm).unwrap_or(0.0),
+                straight_rms_mm: pass.straight_rms_mm(),
                 stop: Stop::Converged,
                 model: model.stepped(&parameters, &step),
                 parameters,

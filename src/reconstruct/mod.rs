@@ -53,7 +53,6 @@ mod seen;
 mod shade;
 pub mod simplify;
 mod square;
-mod straights;
 mod strangers;
 mod stretches;
 mod stripes;

@@ -21,6 +21,9 @@ use super::ramps::Ramps;
 /// Points per chunk of a sum.
 pub(super) const CHUNK: usize = 1024;
 
+/// Fewer points say nothing of how well a straight was scanned.
+const STRAIGHT_POINTS: f64 = 100.0;
+
 /// A point this near to a segment's surface, in tube radii, is on it beyond doubt.
 const ON_SURFACE: f64 = 0.1;
 
@@ -208,6 +211,15 @@ impl Pass {
     /// Median size of the residuals within the cut-off that the pass was made with.
     pub fn median_mm(&self, cutoff_mm: f64) -> Option<f64> {
         self.sizes.median().map(|share| share * cutoff_mm)
+    }
+
+    /// Root mean square residual of each straight's points, as they are weighted; none of too few. A straight that moved under the
+    /// scan, or is bowed or dented, shows here.
+    pub fn straight_rms_mm(&self) -> Vec<Option<f64>> {
+        // Lines and arcs take turns. The tube's radius moves every point alike: its square is the weight.
+        let straights = self.moments.iter().step_by(2);
+        let sums = straights.map(|m| (m[(TUBE_RADIUS, TUBE_RADIUS)], m[(RESIDUAL, RESIDUAL)]));
+        sums.map(|(weight, square)| (weight >= STRAIGHT_POINTS).then(|| (square / weight).sqrt())).collect()
     }
 
     /// By how much a step of iteratively reweighted least squares falls short of Newton's: weights fall as residuals grow.
